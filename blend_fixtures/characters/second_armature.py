@@ -81,10 +81,10 @@ def driver_of_a_bone() -> None:
 
 def driver_of_a_channel() -> None:
     """A driver of a modifier reads a component of a bone's quaternion, although a constraint replaces the rotation."""
-    mesh_object, _ = tube()
+    mesh_object, rig = tube()
     armature_object = add_unlocked_armature()
     constraint = armature_object.pose.bones[BONE].constraints.new("COPY_ROTATION")
-    constraint.target, constraint.subtarget = armature_object, "root"
+    constraint.target, constraint.subtarget = rig, "lower"
     driver = add_cast(mesh_object).driver_add("factor").driver
     variable = driver.variables.new()
     variable.name, variable.targets[0].id = "x", armature_object
