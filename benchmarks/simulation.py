@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,13 +19,15 @@ sys.path.insert(0, str(ROOT))
 import bpy  # noqa: E402
 
 import fdda_addon  # noqa: E402
-from blend_fixtures.flesh import FLESH, add_flesh, make_cloth, make_soft_body  # noqa: E402
+from blend_fixtures.characters.targets import TARGET, add_cloth, add_target_copy  # noqa: E402
 from fdda_addon.arm.rig import build_arm  # noqa: E402
 from fdda_addon.cli.main import main as run_verb  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 
 SOFT_GROUPS = ("shoulder", "elbow")
 """Vertex groups of the upper arm and forearm. With `--kind whole-arm` the hand is soft as well."""
+SOFT_GOAL = 0.9
+"""Goal weight of the soft parts, 0 to 1: a lower goal lets the flesh sag more."""
 TIMED_FRAMES = 60
 PICTURED_POSES = 20
 """Number of held-out poses for the heat map, with a different seed; the three worst are drawn."""
@@ -34,13 +37,36 @@ def build(path: Path, kind: str) -> None:
     """Build the arm with only its Armature modifier, and a copy of it that is simulated flesh."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     build_arm()
-    flesh = add_flesh(next(o for o in bpy.context.scene.objects if o.type == "MESH"))
+    mesh_object = next(o for o in bpy.context.scene.objects if o.type == "MESH")
+    for modifier in [m for m in mesh_object.modifiers if m.type != "ARMATURE"]:
+        mesh_object.modifiers.remove(modifier)
+    flesh = add_target_copy(mesh_object)
     if kind == "cloth":
-        make_cloth(flesh)
+        add_cloth(flesh, quality=5)
     else:
         make_soft_body(flesh, SOFT_GROUPS if kind == "soft-body" else [group.name for group in flesh.vertex_groups])
     bpy.context.scene.frame_set(1)
     save_copy(path)
+
+
+def make_soft_body(flesh: bpy.types.Object, soft_bones: Sequence[str]) -> None:
+    """Add a soft body with springs along the edges and across the faces, and with the skinned surface as its goal.
+
+    Without springs across the faces, faces shear and edges buckle at random. The result then does not look like flesh,
+    and it is not a function of the pose.
+    """
+    soft_group_indices = {flesh.vertex_groups[name].index for name in soft_bones}
+    goal_group = flesh.vertex_groups.new(name="held")
+    for vertex in flesh.data.vertices:
+        weights = {element.group: element.weight for element in vertex.groups}
+        softness = sum(weights.get(index, 0.0) for index in soft_group_indices) / sum(weights.values())
+        goal_group.add([vertex.index], 1 - (1 - SOFT_GOAL) * softness, "REPLACE")
+    flesh.modifiers.new("Softbody", "SOFT_BODY")
+    soft_body = flesh.soft_body
+    soft_body.use_goal, soft_body.goal_default, soft_body.vertex_group_goal = True, 1.0, goal_group.name
+    soft_body.goal_spring, soft_body.goal_friction, soft_body.mass = SOFT_GOAL, 30.0, 0.3
+    soft_body.use_edges, soft_body.pull, soft_body.push, soft_body.damping, soft_body.bend = True, 0.3, 0.3, 50.0, 0.2
+    soft_body.use_stiff_quads, soft_body.shear = True, 0.5
 
 
 def frame_ms(path: Path, shown: str, hidden: str) -> float:
@@ -79,7 +105,7 @@ def main() -> None:
     )
     fdda_addon.register()
     build(rig, options.kind)
-    target_options = ["--object", "arm", "--learn-from", FLESH, "--settle-frames", options.settle_frames]
+    target_options = ["--object", "arm", "--learn-from", TARGET, "--settle-frames", options.settle_frames]
     seconds = {"record": time_verb("record", rig, recording, *target_options, "--poses", options.poses, "--resume")}
     model.parent.mkdir(exist_ok=True)
     seconds["train"] = time_verb("train", recording, model)
@@ -107,8 +133,8 @@ def main() -> None:
         "fdda_mm": errors_mm["fdda"],
         "part": errors_mm["fdda"]["mean"] / errors_mm["linear"]["mean"],
         "repeatability_mm": recording_info.get("repeatability_mm"),
-        "simulation_ms": frame_ms(rig, FLESH, "arm"),
-        "model_ms": frame_ms(bound, "arm", FLESH),
+        "simulation_ms": frame_ms(rig, TARGET, "arm"),
+        "model_ms": frame_ms(bound, "arm", TARGET),
         "seconds": seconds,
     }
     result["faster"] = result["simulation_ms"] / result["model_ms"]

@@ -70,6 +70,16 @@ def lower_weights(points: np.ndarray) -> np.ndarray:
     return t * t * (3.0 - 2.0 * t)
 
 
+def skin(mesh_object: "bpy.types.Object", armature_object: "bpy.types.Object") -> None:
+    """Add the weights of the tube and an Armature modifier to a mesh object."""
+    weights = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices]))
+    for name, values in (("upper", 1.0 - weights), ("lower", weights)):
+        group = mesh_object.vertex_groups.new(name=name)
+        for index in np.flatnonzero(values > 0.0):
+            group.add([int(index)], float(values[index]), "REPLACE")
+    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+
+
 def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
     """Add the elbow to the current scene; return the mesh object `elbow` and the armature object `elbow_rig`.
 
@@ -93,13 +103,7 @@ def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
     elbow = bpy.data.objects.new(ELBOW_OBJECT, mesh)
     bpy.context.scene.collection.objects.link(elbow)
     elbow.parent = rig
-    weights = lower_weights(points)
-    for name, values in (("upper", 1.0 - weights), ("lower", weights)):
-        group = elbow.vertex_groups.new(name=name)
-        for index in np.flatnonzero(values > 0.0):
-            group.add([int(index)], float(values[index]), "REPLACE")
-    skin = elbow.modifiers.new("Armature", "ARMATURE")
-    skin.object = rig
+    skin(elbow, rig)
     smooth = elbow.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.6, 8
     _add_wave(rig)
@@ -110,25 +114,17 @@ def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
 def _add_bones(rig: "bpy.types.Object"):
     import bpy
 
-    layer = bpy.context.view_layer
-    previous_active = layer.objects.active
-    if previous_active is not None and previous_active.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-    layer.objects.active = rig
+    bpy.context.view_layer.objects.active = rig
     bpy.ops.object.mode_set(mode="EDIT")
-    try:
-        bones = rig.data.edit_bones
-        parent = None
-        for name, head, tail in (("upper", START, JOINT), ("lower", JOINT, END)):
-            bone = bones.new(name)
-            bone.head, bone.tail = (head, 0.0, 0.0), (tail, 0.0, 0.0)
-            # Align local Z to the front, so that a positive rotation about X bends the elbow forward.
-            bone.align_roll((0.0, -1.0, 0.0))
-            bone.parent, bone.use_connect = parent, parent is not None
-            parent = bone
-    finally:
-        bpy.ops.object.mode_set(mode="OBJECT")
-        layer.objects.active = previous_active if previous_active is not None else rig
+    parent = None
+    for name, head, tail in (("upper", START, JOINT), ("lower", JOINT, END)):
+        bone = rig.data.edit_bones.new(name)
+        bone.head, bone.tail = (head, 0.0, 0.0), (tail, 0.0, 0.0)
+        # Align local Z to the front, so that a positive rotation about X bends the elbow forward.
+        bone.align_roll((0.0, -1.0, 0.0))
+        bone.parent, bone.use_connect = parent, parent is not None
+        parent = bone
+    bpy.ops.object.mode_set(mode="OBJECT")
 
 
 def _limit_rotation(bone: "bpy.types.PoseBone", ranges):

@@ -139,3 +139,18 @@ def add_delta_mush(mesh_object: bpy.types.Object, iterations: int = 6) -> None:
     """Add delta mush as the last modifier, so that the rig differs from linear skinning."""
     modifier = mesh_object.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
     modifier.rest_source, modifier.factor, modifier.iterations = "ORCO", 0.6, iterations
+
+
+def wave(armature_object: bpy.types.Object, bone_name: str) -> bpy.types.Action:
+    """Key a rotation of a bone in a new action, which the armature object then no longer has."""
+    bone = armature_object.pose.bones[bone_name]
+    bone.rotation_mode = "XYZ"
+    animation = armature_object.animation_data_create()
+    animation.action = bpy.data.actions.new(f"wave {bone_name}")
+    animation.action.use_fake_user = True
+    for frame, angle in ((1, -0.4), (20, 0.6)):
+        bone.rotation_euler = (angle, 0.3 * angle, 0.0)
+        bone.keyframe_insert("rotation_euler", frame=frame)
+    action, animation.action = animation.action, None
+    bone.rotation_euler = (0, 0, 0)
+    return action

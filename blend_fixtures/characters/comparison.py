@@ -16,15 +16,15 @@ from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.poses.sampling import model_channels
 from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import read_stack
-from fdda_addon.rig.reading import PoseReader, read_model_rig
+from fdda_addon.rig.reading import read_model_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.blend_file import save_copy
-from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.mesh import evaluated_positions, rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 from fdda_addon.scene.unit import metres_per_unit
 
+from .base import predicted_positions
 from .rows import Row
 
 HELD_OUT_SETTINGS = EvaluationSettings(poses=25, seed=1, surface=False)
@@ -133,15 +133,8 @@ def _difference(scene_rig: SceneRig, network: Network) -> float:
     """Return the largest difference between the shown mesh and the model's output, computed without the player."""
     if problem := scene_rig.mesh_object.fdda.status:
         raise AssertionError(problem)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    info = network.info
-    reader = PoseReader(scene_rig, info.joint_names, info.rest_matrices)
-    matrices = reader.read(
-        scene_rig.mesh_object.evaluated_get(depsgraph), scene_rig.armature_object.evaluated_get(depsgraph)
-    )
-    controls = ControlReader(scene_rig, info.controls).read(scene_rig, depsgraph)
-    shown_positions = evaluated_positions(scene_rig.mesh_object, depsgraph)
-    return float(np.abs(shown_positions - network.positions(matrices[None], controls[None])[0]).max())
+    shown_positions = evaluated_positions(scene_rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+    return float(np.abs(shown_positions - predicted_positions(scene_rig, network)).max())
 
 
 def _link_and_override(scene_rig: SceneRig, folder: Path) -> list[SceneRig]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from blend_fixtures.elbow import END, JOINT
 
-from .base import tube
+from .base import add_key, drive, tube
 from .bones import NewBone, add_bone_collection, add_bones, limit
 from .targets import add_target_copy
 
@@ -47,26 +47,22 @@ def control_face() -> None:
         follow.owner_space = follow.target_space = "LOCAL"
         near = [vertex.index for vertex in flesh.data.vertices if abs(vertex.co.x - place) < 0.03]
         flesh.vertex_groups.new(name=f"{name}_skin").add(near, 1.0, "ADD")
-    _add_key(flesh, "lid", lambda points: points * (1, 1.25, 1), 'pose.bones["lid"].rotation_euler[1]', "sin(v)")
-    _add_key(flesh, "smile", lambda points: points + np.array([0, 0, 0.02]), 'pose.bones["mouth"]["smile"]', "v")
-    _add_key(flesh, "open", lambda points: points + np.array([0, 0.02, 0]), 'pose.bones["mouth"].scale[2]', "v - 1")
+    _add_key(flesh, "lid", lambda points: points * (1, 1.25, 1), 'pose.bones["lid"].rotation_euler[1]', "sin(value)")
+    _add_key(flesh, "smile", lambda points: points + np.array([0, 0, 0.02]), 'pose.bones["mouth"]["smile"]', "value")
+    _add_key(flesh, "open", lambda points: points + np.array([0, 0.02, 0]), 'pose.bones["mouth"].scale[2]', "value - 1")
 
 
 def _add_key(
     flesh: bpy.types.Object, name: str, move: Callable[[np.ndarray], np.ndarray], path: str, expression: str
 ) -> None:
-    """Add a shape key near the end of the target, and drive it with an expression of the number `v` at a path."""
-    if flesh.data.shape_keys is None:
-        flesh.shape_key_add(name="Basis", from_mix=False)
-    key = flesh.shape_key_add(name=name, from_mix=False)
+    """Add a shape key near the end of the target, and drive it with an expression of the number `value` at a path."""
+
+    def move_end(points: np.ndarray) -> np.ndarray:
+        return points + np.clip((points[:, :1] - JOINT) / (END - JOINT), 0, 1) * (move(points) - points)
+
+    key = add_key(flesh, name, move_end)
     key.slider_min = -1.0
-    points = np.array([point.co for point in key.data])
-    amounts = np.clip((points[:, :1] - JOINT) / (END - JOINT), 0, 1)
-    key.data.foreach_set("co", (points + amounts * (move(points) - points)).astype(np.float32).ravel())
-    driver = key.driver_add("value").driver
-    variable = driver.variables.new()
-    variable.name, driver.expression = "v", expression
-    variable.targets[0].id, variable.targets[0].data_path = bpy.data.objects[ARMATURE], path
+    drive(key, "value", bpy.data.objects[ARMATURE], path, expression)
 
 
 def add_speech() -> bpy.types.Action:

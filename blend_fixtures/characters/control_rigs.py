@@ -4,9 +4,9 @@
 The control bones are in the bone collection `Controls`.
 """
 
-from .base import bulge, tube
+from .base import add_key, bulge, drive, tube
 from .bones import NewBone, add_bone_collection, add_bones, add_delta_mush, limit, remove_constraints
-from .controls import add_key, add_property, drive_by_property
+from .controls import add_property
 
 CONTROLS = "Controls"
 
@@ -44,7 +44,7 @@ def ik_fk() -> None:
         for chain in ("fk", "ik"):
             copy = bones[name].constraints.new("COPY_TRANSFORMS")
             copy.name, copy.target, copy.subtarget = chain, armature_object, f"{chain}_{name}"
-        drive_by_property(bones[name].constraints["ik"], "influence", armature_object, '["ik"]')
+        drive(bones[name].constraints["ik"], "influence", armature_object, '["ik"]')
     add_bone_collection(armature_object, CONTROLS, "fk_upper", "fk_lower", "ik_hand", "ik_pole")
     add_delta_mush(mesh_object)
 
@@ -63,13 +63,6 @@ def face_slider() -> None:
     remove_constraints(bones["lower"])
     child_target = bones["lower"].constraints.new("ARMATURE").targets.new()
     child_target.target, child_target.subtarget = armature_object, "jaw"
-    smile_key = add_key(mesh_object, "smile", bulge)
-    driver = smile_key.driver_add("value").driver
-    variable = driver.variables.new()
-    variable.name, variable.type = "slider_y", "TRANSFORMS"
-    target = variable.targets[0]
-    target.id, target.bone_target = armature_object, "slider"
-    target.transform_type, target.transform_space = "LOC_Y", "LOCAL_SPACE"
-    driver.expression = "10 * slider_y"
+    drive(add_key(mesh_object, "smile", bulge), "value", armature_object, ("slider", "LOC_Y"), "10 * value")
     add_bone_collection(armature_object, CONTROLS, "slider", "jaw")
     add_delta_mush(mesh_object)

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Build characters with inputs beside their joints; each function builds one from the tube of `base`."""
 
-from collections.abc import Callable
-
 import bpy
-import numpy as np
 
-from .base import bulge, link, tube
+from .base import add_key, add_lattice, bulge, drive, link, tube
 from .bones import NewBone, add_bones, add_delta_mush
 
 
@@ -14,7 +11,7 @@ def custom_property() -> None:
     """Build a tube with a custom property of the armature object that drives a shape key."""
     mesh_object, armature_object = tube()
     add_property(armature_object, "flex")
-    drive_by_property(add_key(mesh_object, "flexed", bulge), "value", armature_object, '["flex"]')
+    drive(add_key(mesh_object, "flexed", bulge), "value", armature_object, '["flex"]')
     add_delta_mush(mesh_object)
 
 
@@ -33,7 +30,7 @@ def constraint_influence() -> None:
     copy = armature_object.pose.bones["lower"].constraints.new("COPY_ROTATION")
     copy.name, copy.target, copy.subtarget, copy.influence = "Rest", armature_object, "rest", 0.0
     path = 'pose.bones["lower"].constraints["Rest"].influence'
-    drive_by_property(add_key(mesh_object, "flexed", bulge), "value", armature_object, path)
+    drive(add_key(mesh_object, "flexed", bulge), "value", armature_object, path)
     add_delta_mush(mesh_object)
 
 
@@ -43,7 +40,7 @@ def modifier_strength() -> None:
     add_property(mesh_object, "softness")
     modifier = mesh_object.modifiers.new("Smooth", "SMOOTH")
     modifier.iterations = 6
-    drive_by_property(modifier, "factor", mesh_object, '["softness"]')
+    drive(modifier, "factor", mesh_object, '["softness"]')
 
 
 def undriven_strength() -> None:
@@ -55,13 +52,7 @@ def undriven_strength() -> None:
 def lattice_shape_key() -> None:
     """Build a tube that a lattice deforms before the skinning; an animator sets the lattice's shape key by hand."""
     mesh_object, _ = tube()
-    data = bpy.data.lattices.new("lattice")
-    data.points_u, data.points_v, data.points_w = 6, 3, 3
-    lattice_object = link(bpy.data.objects.new("lattice", data))
-    lattice_object.location, lattice_object.scale = (0.25, 0.0, 0.0), (0.6, 0.15, 0.15)
-    add_key(lattice_object, "thick", lambda points: points * (1.0, 1.5, 1.5))
-    mesh_object.modifiers.new("Lattice", "LATTICE").object = lattice_object
-    mesh_object.modifiers.move(1, 0)
+    add_key(add_lattice(mesh_object), "thick", lambda points: points * (1.0, 1.5, 1.5))
     add_delta_mush(mesh_object)
 
 
@@ -69,11 +60,7 @@ def dial() -> None:
     """Build a tube with a shape key that the X location of another object drives."""
     mesh_object, _ = tube()
     dial_object = link(bpy.data.objects.new("dial", None))
-    driver = add_key(mesh_object, "flexed", bulge).driver_add("value").driver
-    variable = driver.variables.new()
-    variable.name, variable.type = "dial_x", "TRANSFORMS"
-    variable.targets[0].id, variable.targets[0].transform_type = dial_object, "LOC_X"
-    driver.expression = "2 * dial_x"
+    drive(add_key(mesh_object, "flexed", bulge), "value", dial_object, ("", "LOC_X"), "2 * value")
     add_delta_mush(mesh_object)
 
 
@@ -90,28 +77,3 @@ def add_property(owner: bpy.types.ID, name: str) -> None:
     owner.id_properties_ui(name).update(min=0.0, max=1.0)
     # Without the tag, a driver that reads the property before the next depsgraph update is marked invalid.
     owner.update_tag()
-
-
-def add_key(owner: bpy.types.Object, name: str, move: Callable[[np.ndarray], np.ndarray]) -> bpy.types.ShapeKey:
-    """Add a shape key.
-
-    Args:
-        owner: a mesh or lattice object.
-        name: name of the key.
-        move: function from the points of the basis to the points of the key, (N, 3) each, in the owner's space.
-    """
-    if owner.data.shape_keys is None:
-        owner.shape_key_add(name="Basis", from_mix=False)
-    key = owner.shape_key_add(name=name, from_mix=False)
-    points = move(np.array([point.co for point in key.data]))
-    key.data.foreach_set("co", points.astype(np.float32).ravel())
-    return key
-
-
-def drive_by_property(owner: bpy.types.bpy_struct, attribute: str, source: bpy.types.ID, path: str) -> None:
-    """Drive a property with the unchanged value of another property."""
-    driver = owner.driver_add(attribute).driver
-    variable = driver.variables.new()
-    variable.name = "value"
-    variable.targets[0].id, variable.targets[0].data_path = source, path
-    driver.expression = "value"

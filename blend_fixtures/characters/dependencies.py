@@ -6,7 +6,7 @@ Each function of `DEPENDENCIES` makes the bone `lower` of a tube depend on the b
 
 import bpy
 
-from .base import link, tube
+from .base import drive, link, tube
 from .bones import NewBone, add_bone_collection, add_bones, add_delta_mush
 from .controls import add_property
 
@@ -173,14 +173,9 @@ def _context_property(armature_object: bpy.types.Object, source: str) -> None:
 
 def _view_layer_property(armature_object: bpy.types.Object, source: str) -> None:
     """Drive `lower` by a custom property of the view layer that the source drives."""
-    scene, view_layer = bpy.context.scene, bpy.context.view_layer
+    view_layer = bpy.context.view_layer
     view_layer["bend"] = 0.0
-    driver = scene.driver_add(f'{view_layer.path_from_id()}["bend"]').driver
-    driver.type = "SUM"
-    variable = driver.variables.new()
-    variable.type = "TRANSFORMS"
-    target = variable.targets[0]
-    target.id, target.bone_target, target.transform_type = armature_object, source, "LOC_Z"
+    drive(bpy.context.scene, f'{view_layer.path_from_id()}["bend"]', armature_object, (source, "LOC_Z"))
     _drive(armature_object, "CONTEXT_PROP", context_property="ACTIVE_VIEW_LAYER", data_path='["bend"]')
 
 
@@ -194,24 +189,13 @@ def _pointer(armature_object: bpy.types.Object, source: str) -> None:
 def _driven_property(armature_object: bpy.types.Object, source: str) -> None:
     """Drive `lower` by a custom property of the object that the source drives."""
     add_property(armature_object, "bend")
-    driver = armature_object.driver_add('["bend"]').driver
-    driver.type = "SUM"
-    variable = driver.variables.new()
-    variable.type = "TRANSFORMS"
-    target = variable.targets[0]
-    target.id, target.bone_target, target.transform_type = armature_object, source, "LOC_Z"
+    drive(armature_object, '["bend"]', armature_object, (source, "LOC_Z"))
     _drive(armature_object, "SINGLE_PROP", id=armature_object, data_path='["bend"]')
 
 
 def _driven_influence(armature_object: bpy.types.Object, source: str) -> None:
     """Drive the influence of a constraint of `lower`."""
-    constraint = _constrain(armature_object, "COPY_ROTATION", "control")
-    driver = constraint.driver_add("influence").driver
-    driver.type = "SUM"
-    variable = driver.variables.new()
-    variable.type = "TRANSFORMS"
-    target = variable.targets[0]
-    target.id, target.bone_target, target.transform_type = armature_object, source, "LOC_X"
+    drive(_constrain(armature_object, "COPY_ROTATION", "control"), "influence", armature_object, (source, "LOC_X"))
 
 
 def _bone_parent(armature_object: bpy.types.Object, source: str) -> None:

@@ -14,9 +14,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .base import link
+from .base import add_key, add_variable, link
 from .bones import NewBone, add_bones, limit
-from .controls import add_key
 
 MESH, ARMATURE, SPEECH = "face", "face_rig", "speech"
 FRAMES = 80
@@ -137,24 +136,38 @@ def _corrective_moves() -> dict[tuple[str, str], Callable[[np.ndarray], np.ndarr
 
 def face() -> None:
     """Build the mesh object `face` and the armature object `face_rig` in the current scene."""
-    points, faces = head_surface()
-    mesh = bpy.data.meshes.new(MESH)
-    mesh.from_pydata(points.tolist(), [], faces)
-    mesh_object = link(bpy.data.objects.new(MESH, mesh))
-    armature_object = link(bpy.data.objects.new(ARMATURE, bpy.data.armatures.new(ARMATURE)))
-    mesh_object.parent = armature_object
+    mesh_object, armature_object, points = add_head()
     _add_face_bones(armature_object)
-    _add_weights(mesh_object, points)
-    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    add_groups(mesh_object, _face_weights(points))
     for name, move in _shape_key_moves().items():
         add_key(mesh_object, name, move)
     for (first, second), move in _corrective_moves().items():
         _drive_by_product(
             add_key(mesh_object, f"{first}_{second}", move), mesh_object, armature_object, (first, second)
         )
+    bpy.context.view_layer.update()
+
+
+def add_head() -> tuple[bpy.types.Object, bpy.types.Object, np.ndarray]:
+    """Add the head with its modifiers; return mesh object, armature object without bones, and points (5186, 3)."""
+    points, faces = head_surface()
+    mesh = bpy.data.meshes.new(MESH)
+    mesh.from_pydata(points.tolist(), [], faces)
+    mesh_object = link(bpy.data.objects.new(MESH, mesh))
+    armature_object = link(bpy.data.objects.new(ARMATURE, bpy.data.armatures.new(ARMATURE)))
+    mesh_object.parent = armature_object
+    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
     smooth = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.5, 6
-    bpy.context.view_layer.update()
+    return mesh_object, armature_object, points
+
+
+def add_groups(mesh_object: bpy.types.Object, weights: dict[str, np.ndarray]) -> None:
+    """Add vertex groups with the (V,) weights of bones."""
+    for name, bone_weights in weights.items():
+        group = mesh_object.vertex_groups.new(name=name)
+        for index in np.flatnonzero(bone_weights > 1e-3):
+            group.add([int(index)], float(bone_weights[index]), "REPLACE")
 
 
 def _add_face_bones(armature_object: bpy.types.Object) -> None:
@@ -175,21 +188,22 @@ def _add_face_bones(armature_object: bpy.types.Object) -> None:
         limit(pose[name], "LIMIT_ROTATION", ranges)
 
 
-def _add_weights(mesh_object: bpy.types.Object, points: np.ndarray) -> None:
-    """Add weights that fall off around each part; the jaw gets the lower face, the head gets the remaining weight."""
+def _face_weights(points: np.ndarray) -> dict[str, np.ndarray]:
+    """Return weights that fall off around each part; the jaw gets the lower face, the head what remains."""
     weights = {name: np.exp(-((_angle_from_part(points, name) / 0.2) ** 2)) for name in PART_ANGLES if name != "jaw"}
-    heights = points[:, 2] / RADII[2]
-    weights["jaw"] = 0.7 / (1 + np.exp((heights + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
+    weights["jaw"] = 0.7 * lower_face(points)
     weight_sums = sum(weights.values())
     weights = {
         name: part_weights * np.minimum(1, 0.97 / np.maximum(weight_sums, 1e-9))
         for name, part_weights in weights.items()
     }
-    weights["head"] = 1 - sum(weights.values())
-    for name, part_weights in weights.items():
-        group = mesh_object.vertex_groups.new(name=name)
-        for index in np.flatnonzero(part_weights > 1e-3):
-            group.add([int(index)], float(part_weights[index]), "REPLACE")
+    return weights | {"head": 1 - sum(weights.values())}
+
+
+def lower_face(points: np.ndarray) -> np.ndarray:
+    """Return the (V,) weights of the lower face, 0 to 1."""
+    heights = points[:, 2] / RADII[2]
+    return 1 / (1 + np.exp((heights + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
 
 
 def _drive_by_product(
@@ -201,26 +215,18 @@ def _drive_by_product(
     """Drive a shape key by the product of two shape keys, or of a shape key and the opening of the jaw."""
     driver = key.driver_add("value").driver
     for letter, name in zip("ab", driving_names, strict=True):
-        variable = driver.variables.new()
-        variable.name = letter
         if name == "jaw":
-            variable.type = "TRANSFORMS"
-            target = variable.targets[0]
-            target.id, target.bone_target = armature_object, "jaw"
-            target.transform_type, target.transform_space = "ROT_X", "LOCAL_SPACE"
+            add_variable(driver, letter, armature_object, ("jaw", "ROT_X"))
         else:
-            target = variable.targets[0]
-            target.id_type, target.id = "KEY", mesh_object.data.shape_keys
-            target.data_path = f'key_blocks["{name}"].value'
+            add_variable(driver, letter, mesh_object.data.shape_keys, f'key_blocks["{name}"].value')
     driver.expression = f"a * b / {-JAW_OPENING:.6f}" if "jaw" in driving_names else "a * b"
 
 
-def add_speech() -> bpy.types.Action:
-    """Add the action `speech`: many bones and shape keys move at the same time, each at a different rate."""
-    armature_object, keys = bpy.data.objects[ARMATURE], bpy.data.objects[MESH].data.shape_keys
-    animation = armature_object.animation_data_create()
-    animation.action = action = bpy.data.actions.new(SPEECH)
-    undriven_blocks = [block for block in keys.key_blocks[1:] if block.name in _shape_key_moves()]
+def add_performance(mesh_object: bpy.types.Object, name: str) -> bpy.types.Action:
+    """Add an action in which all bones and the shape keys without drivers move at the same time, at different rates."""
+    armature_object, keys = mesh_object.find_armature(), mesh_object.data.shape_keys
+    action = bpy.data.actions.new(name)
+    armature_object.animation_data_create().action = action
     for frame in range(1, FRAMES + 1, 4):
         for index, bone in enumerate(armature_object.pose.bones):
             (limit_constraint,) = bone.constraints
@@ -231,13 +237,15 @@ def add_speech() -> bpy.types.Action:
                     bone.rotation_euler[axis] = low + (high - low) * fraction
             bone.keyframe_insert("rotation_euler", frame=frame)
     key_animation = keys.animation_data_create()
+    driven_paths = {curve.data_path for curve in key_animation.drivers}
+    blocks = [b for b in keys.key_blocks[1:] if f'key_blocks["{b.name}"].value' not in driven_paths]
     action.slots.new(id_type="KEY", name=keys.name)
     key_animation.action = action
     for frame in range(1, FRAMES + 1, 4):
-        for index, block in enumerate(undriven_blocks):
-            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * index) + 1.7 * index))
+        for index, block in enumerate(blocks):
+            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * (index % 30)) + 1.7 * index))
             keys.keyframe_insert(f'key_blocks["{block.name}"].value', frame=frame)
-    for block in undriven_blocks:
+    for block in blocks:
         block.value = 0.0
     key_animation.action = None
     return action
@@ -247,7 +255,7 @@ def main(output_path: Path) -> None:
     """Build the face with its action, and save it."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     face()
-    add_speech()
+    add_performance(bpy.data.objects[MESH], SPEECH)
     bpy.ops.wm.save_as_mainfile(filepath=str(output_path.absolute()), copy=True)
 
 

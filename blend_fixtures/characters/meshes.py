@@ -4,9 +4,9 @@
 import bpy
 import numpy as np
 
-from blend_fixtures.elbow import END, START
+from blend_fixtures.elbow import END, START, skin
 
-from .base import cage, link, skin, tube
+from .base import cage, link, tube
 from .bones import NewBone, add_bones, add_delta_mush, limit
 
 CHAINS, BONES_PER_CHAIN = 25, 20

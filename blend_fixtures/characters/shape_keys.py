@@ -5,7 +5,6 @@
 of `face` with two bones, and have an action; the correctives are on the sample arm, which has one.
 """
 
-import math
 import sys
 from pathlib import Path
 
@@ -14,12 +13,10 @@ import numpy as np
 
 from fdda_addon.arm.rig import build_arm
 
-from .base import link
+from .base import add_key, drive
 from .bones import NewBone, add_bones, limit
-from .controls import add_key
-from .face import PART_ANGLES, RADII, head_surface, move_near
+from .face import PART_ANGLES, add_groups, add_head, add_performance, lower_face, move_near
 
-ACTION, FRAMES = "performance", 80
 SIDES = ("Left", "Right")
 ARKIT_PARTS = {
     **{f"{name}{side}": f"{part}.{side[0]}" for side in SIDES for name, part in (
@@ -51,11 +48,7 @@ def many_keys() -> None:
 
 def _build_head(parts: dict[str, str]) -> None:
     """Build a head, skull and jaw as bones, with a shape key near a part of the face for each name."""
-    points, faces = head_surface()
-    mesh = bpy.data.meshes.new("face")
-    mesh.from_pydata(points.tolist(), [], faces)
-    mesh_object = link(bpy.data.objects.new("face", mesh))
-    armature_object = link(bpy.data.objects.new("face_rig", bpy.data.armatures.new("face_rig")))
+    mesh_object, armature_object, points = add_head()
     add_bones(
         armature_object,
         NewBone("head", (0.0, 0.02, -0.12), (0.0, 0.02, 0.1)),
@@ -63,16 +56,12 @@ def _build_head(parts: dict[str, str]) -> None:
     )
     limit(armature_object.pose.bones["head"], "LIMIT_ROTATION", {0: (-20.0, 20.0), 1: (-30.0, 30.0)})
     limit(armature_object.pose.bones["jaw"], "LIMIT_ROTATION", {0: (-25.0, 0.0)})
-    jaw_weights = 1 / (1 + np.exp((points[:, 2] / RADII[2] + 0.42) * 18)) / (1 + np.exp(points[:, 1] / RADII[1] * 12))
-    _add_group(mesh_object, "jaw", jaw_weights)
-    _add_group(mesh_object, "head", 1 - jaw_weights)
-    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    weights = lower_face(points)
+    add_groups(mesh_object, {"jaw": weights, "head": 1 - weights})
     random = np.random.default_rng(0)
     for name, part in parts.items():
         add_key(mesh_object, name, move_near(part, tuple(random.uniform(-6, 6, 3)), random.uniform(0.08, 0.25)))
-    smooth = mesh_object.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
-    smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.5, 6
-    _add_performance(mesh_object, armature_object)
+    add_performance(mesh_object, "performance")
 
 
 def corrected_arm() -> None:
@@ -89,43 +78,9 @@ def corrected_arm() -> None:
         def bulge(at: np.ndarray, center=center, offset=offset, radius=radius) -> np.ndarray:
             return at + np.exp(-(((at - center) / radius) ** 2).sum(axis=1))[:, None] * offset
 
-        driver = add_key(mesh_object, f"{bone.name}_{index:02}", bulge).driver_add("value").driver
-        variable = driver.variables.new()
-        variable.name, variable.type = "angle", "TRANSFORMS"
-        target = variable.targets[0]
-        target.id, target.bone_target = armature_object, bone.name
-        target.transform_type, target.transform_space = f"ROT_{'XYZ'[axis]}", "LOCAL_SPACE"
-        driver.expression = f"min(1, max(0, {random.choice([-1.5, 1.5])} * angle))"
-
-
-def _add_group(mesh_object: bpy.types.Object, name: str, weights: np.ndarray) -> None:
-    group = mesh_object.vertex_groups.new(name=name)
-    for index in np.flatnonzero(weights > 1e-3):
-        group.add([int(index)], float(weights[index]), "REPLACE")
-
-
-def _add_performance(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> None:
-    """Add an action in which bones and shape keys move at the same time, each at a different rate."""
-    action = bpy.data.actions.new(ACTION)
-    armature_object.animation_data_create().action = action
-    for frame in range(1, FRAMES + 1, 4):
-        for index, bone in enumerate(armature_object.pose.bones):
-            (constraint,) = bone.constraints
-            for axis, letter in enumerate("xyz"):
-                low, high = getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}")
-                fraction = 0.5 + 0.45 * math.sin(frame * (0.11 + 0.017 * index) + 2.1 * index + axis)
-                bone.rotation_euler[axis] = low + (high - low) * fraction
-            bone.keyframe_insert("rotation_euler", frame=frame)
-    keys = mesh_object.data.shape_keys
-    action.slots.new(id_type="KEY", name=keys.name)
-    keys.animation_data_create().action = action
-    for frame in range(1, FRAMES + 1, 4):
-        for index, block in enumerate(keys.key_blocks[1:]):
-            block.value = max(0.0, math.sin(frame * (0.09 + 0.013 * (index % 30)) + 1.7 * index))
-            keys.keyframe_insert(f'key_blocks["{block.name}"].value', frame=frame)
-    for block in keys.key_blocks[1:]:
-        block.value = 0.0
-    keys.animation_data.action = None
+        key, channel = add_key(mesh_object, f"{bone.name}_{index:02}", bulge), f"ROT_{'XYZ'[axis]}"
+        expression = f"min(1, max(0, {random.choice([-1.5, 1.5])} * value))"
+        drive(key, "value", armature_object, (bone.name, channel), expression)
 
 
 def main(name: str, output_path: Path) -> None:

@@ -7,7 +7,9 @@ from itertools import pairwise
 import bpy
 import numpy as np
 
-from .base import add_driven_key, bulge, cage, drive, link, skin, tube
+from blend_fixtures.elbow import skin
+
+from .base import BEND, add_driven_key, add_lattice, bulge, cage, drive, link, tube
 
 
 def corrective_smooth() -> None:
@@ -21,14 +23,7 @@ def corrective_smooth() -> None:
 def lattice() -> None:
     """Build a tube that a lattice deforms before the skinning; the elbow drives a shape key of the lattice."""
     mesh_object, armature_object = tube()
-    data = bpy.data.lattices.new("lattice")
-    data.points_u, data.points_v, data.points_w = 6, 3, 3
-    lattice_object = link(bpy.data.objects.new("lattice", data))
-    lattice_object.location, lattice_object.scale = (0.25, 0.0, 0.0), (0.6, 0.15, 0.15)
-    add_driven_key(lattice_object, armature_object, lambda points: points * (1.0, 1.4, 1.4))
-    modifier = mesh_object.modifiers.new("Lattice", "LATTICE")
-    modifier.object = lattice_object
-    _move_first(mesh_object, modifier)
+    add_driven_key(add_lattice(mesh_object), armature_object, lambda points: points * (1.0, 1.4, 1.4))
 
 
 def mesh_deform() -> None:
@@ -153,7 +148,7 @@ def absolute_shape_keys() -> None:
     keys = mesh_object.data.shape_keys
     keys.use_relative = False
     # Blender spaces absolute shape keys ten frames apart.
-    drive(keys, "eval_time", armature_object, "10 * bend")
+    drive(keys, "eval_time", armature_object, BEND, "10 * value")
 
 
 def displace() -> None:

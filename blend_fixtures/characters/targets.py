@@ -16,7 +16,7 @@ import numpy as np
 from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.scene.mesh import evaluated_positions
 
-from .base import bulge, tube
+from .base import add_key, bulge, tube
 from .stacks import build_node_chain
 
 TARGET = "flesh"
@@ -71,10 +71,7 @@ def target_shape_keys() -> None:
     """Build the target as a copy with a shape key whose value is keyed in every frame of the action."""
     mesh_object, armature_object = tube()
     flesh = add_target_copy(mesh_object)
-    flesh.shape_key_add(name="Basis", from_mix=False)
-    key = flesh.shape_key_add(name="flexed", from_mix=False)
-    points = np.array([point.co for point in key.data])
-    key.data.foreach_set("co", bulge(points).astype(np.float32).ravel())
+    key = add_key(flesh, "flexed", bulge)
     scene, bone = bpy.context.scene, armature_object.pose.bones["lower"]
     for frame in range(1, FRAMES + 1):
         scene.frame_set(frame)
@@ -97,11 +94,16 @@ def target_soft_body() -> bpy.types.Object:
 def target_cloth() -> bpy.types.Object:
     """Build the target as a copy with cloth that has a pin weight of one half; return the copy."""
     flesh = add_target_copy(tube()[0])
+    add_cloth(flesh)
+    return flesh
+
+
+def add_cloth(flesh: bpy.types.Object, quality: int = 4) -> None:
+    """Add cloth with a pin weight of one half, so that gravity and stretching edges move the mesh."""
     pin_group = flesh.vertex_groups.new(name="pin")
     pin_group.add(range(len(flesh.data.vertices)), 0.5, "REPLACE")
     settings = flesh.modifiers.new("Cloth", "CLOTH").settings
-    settings.vertex_group_mass, settings.quality, settings.air_damping = "pin", 4, 10.0
-    return flesh
+    settings.vertex_group_mass, settings.quality, settings.air_damping = "pin", quality, 10.0
 
 
 def target_geometry_nodes() -> bpy.types.Object:

@@ -2,12 +2,16 @@
 """Fixtures of the Blender tests, above all the elbow's files; and functions that read and compare positions."""
 
 import hashlib
+import io
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -15,12 +19,11 @@ import pytest
 from filelock import FileLock
 
 import fdda_addon
+from blend_fixtures.characters import base
 from blend_fixtures.characters.training import Trainings
 from fdda_addon.cli.main import main
 from fdda_addon.core.formats.model import METADATA_KEY
-from fdda_addon.rig.reading import PoseReader
 from fdda_addon.runtime.network import Network
-from fdda_addon.scene.control_reader import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 
 ELBOW = "elbow"
@@ -37,6 +40,19 @@ class ElbowFiles:
     bound: Path
 
 
+class Trained(NamedTuple):
+    """Paths of a character's files, all in one folder."""
+
+    rig: Path
+    recording: Path
+    model: Path
+
+    def open(self, name: str = "") -> SceneRig:
+        """Open the file of the rig, and return its rig."""
+        bpy.ops.wm.open_mainfile(filepath=str(self.rig))
+        return find_rig(name)
+
+
 ADDED = {"FDDA": (False, False), "FDDA Undeformed": (False, False)}
 """The modifiers that a binding adds, with their visibility in viewport and render while the rig is shown."""
 
@@ -44,6 +60,20 @@ ADDED = {"FDDA": (False, False), "FDDA Undeformed": (False, False)}
 def run(*arguments: object) -> int:
     """Run a verb of the command line, and return its exit status."""
     return main([str(argument) for argument in arguments], "fdda")
+
+
+@dataclass(frozen=True)
+class CommandOutput:
+    """Lines that a command printed to stdout and to stderr."""
+
+    out: list[str]
+    err: list[str]
+
+
+def output_of(*arguments: object, status: int = 0) -> CommandOutput:
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert run(*arguments) == status, err.getvalue()
+    return CommandOutput(out.getvalue().splitlines(), err.getvalue().splitlines())
 
 
 @cache
@@ -62,6 +92,25 @@ def train(recording: Path, model: Path, *options: object) -> None:
         _shared_trainings.cache_clear()
         trainings.close()
         raise
+
+
+def build_and_train(folder: Path, build: Callable, *options: object, training: tuple = ("--passes", 40)) -> Trained:
+    """Build a character in an empty file, save and record it, and train a model.
+
+    Args:
+        folder: an existing folder for the files.
+        build: function that builds the character in the current scene.
+        options, training: options of `record` and `train`.
+    """
+    from fdda_addon.scene.blend_file import save_copy
+
+    files = Trained(*(folder / name for name in ("rig.blend", "recording", "model.onnx")))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build()
+    save_copy(files.rig)
+    assert run("record", files.rig, files.recording, *options) == 0
+    train(files.recording, files.model, *training)
+    return files
 
 
 def pytest_sessionfinish() -> None:
@@ -113,18 +162,24 @@ def without_deformation(model: Path) -> Path:
 
 def with_deformation(model: Path, deformation: dict) -> Path:
     """Write a copy of a model that requires other modifiers, shape keys and drivers, in the same folder."""
-    import json
 
-    import onnx
+    def edit(info: dict) -> None:
+        info["meshes"][0]["fingerprint"]["deformation"] = deformation
 
     # Test processes share the folder.
-    loaded, path = onnx.load(model), model.with_name(f"other_{os.getpid()}_{model.name}")
-    (prop,) = (prop for prop in loaded.metadata_props if prop.key == METADATA_KEY)
-    info = json.loads(prop.value)
-    info["meshes"][0]["fingerprint"]["deformation"] = deformation
-    prop.value = json.dumps(info)
-    onnx.save(loaded, path)
-    return path
+    return write_edited(model, model.with_name(f"other_{os.getpid()}_{model.name}"), edit_metadata(edit))
+
+
+def edit_metadata(edit: Callable[[dict], object]) -> Callable:
+    """Return a function for `write_edited` that changes the metadata of a model."""
+
+    def change(proto) -> None:
+        (prop,) = (prop for prop in proto.metadata_props if prop.key == METADATA_KEY)
+        info = json.loads(prop.value)
+        edit(info)
+        prop.value = json.dumps(info)
+
+    return change
 
 
 def write_edited(model: Path, path: Path, edit: Callable) -> Path:
@@ -177,16 +232,6 @@ def rig(elbow_files: ElbowFiles) -> SceneRig:
     """Open the elbow's file, and return its rig."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow_files.rig))
     return find_rig()
-
-
-@pytest.fixture
-def unusual_rig() -> SceneRig:
-    """Build an elbow whose animation, pose and selection differ from all defaults."""
-    from .scene_state import fresh_elbow, set_unusual_state
-
-    rig = fresh_elbow()
-    set_unusual_state(rig)
-    return rig
 
 
 @pytest.fixture
@@ -254,14 +299,7 @@ def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
 def predicted_positions(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
     """Return the model's positions (V, 3) for the evaluated pose, computed without the code for playback."""
     network = Network(model).of_mesh(mesh_object.fdda.model_mesh)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    armature_object = armature_of(mesh_object)
-    names = tuple(joint.name for joint in network.info.joints)
-    scene_rig = SceneRig(mesh_object, armature_object)
-    reader = PoseReader(scene_rig, names, network.info.rest_matrices)
-    matrices = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
-    controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
-    return network.positions(matrices[None], controls[None])[0]
+    return base.predicted_positions(SceneRig(mesh_object, armature_of(mesh_object)), network)
 
 
 def assert_plays(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
+from blend_fixtures.characters.base import drive
+
 from .conftest import ELBOW, ELBOW_RIG
 
 REST_POSE_OF, WEIGHTS_DIFFER = "the rest pose of the", "the skin weights differ"
@@ -133,11 +135,8 @@ def trigger_check(update: str) -> None:
 
 def drive_b_bone() -> None:
     """Drive a setting of the armature data by a bone, as Rigify does: Blender reports the data in every frame."""
-    driver = bpy.data.objects[ELBOW_RIG].data.driver_add('bones["lower"].bbone_easein').driver
-    variable = driver.variables.new()
-    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
-    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
-    driver.type = "SUM"
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    drive(armature_object.data, 'bones["lower"].bbone_easein', armature_object, ("lower", "ROT_X"))
     bpy.context.view_layer.update()
 
 

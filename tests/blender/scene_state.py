@@ -63,32 +63,6 @@ def scene_state(rig: SceneRig) -> dict:
     }
 
 
-def set_unusual_state(rig: SceneRig) -> None:
-    """Give everything that jobs change a value that differs from its default."""
-    armature_object = rig.armature_object
-    animation = armature_object.animation_data
-    other_action = bpy.data.actions.new("other")
-    track = animation.nla_tracks.new()
-    track.name = "below"
-    track.strips.new("wave", 40, bpy.data.actions["elbow_wave"])
-    animation.action = other_action
-    for frame, angle in ((1, 0.0), (20, 0.4)):
-        armature_object.pose.bones["upper"].rotation_euler[1] = angle
-        armature_object.pose.bones["upper"].keyframe_insert("rotation_euler", index=1, frame=frame)
-    bpy.context.scene.frame_set(7, subframe=0.25)
-    # These values have no keyframes, and differ from the animated values of this frame.
-    upper, lower = (armature_object.pose.bones[name] for name in ("upper", "lower"))
-    upper.rotation_euler = (0.1, 0.2, 0.3)
-    lower.rotation_euler[0] = 1.1
-    lower.location, lower.scale = (0.01, 0, 0), (1, 1.1, 1)
-    lower.rotation_quaternion = (0.5, 0.5, 0.5, 0.5)
-    lower["mood"], armature_object["mood"] = 0.5, 2.0
-    rig.mesh_object.modifiers.new("Off", "CAST").show_viewport = False
-    rig.mesh_object.select_set(True)
-    armature_object.select_set(False)
-    bpy.context.view_layer.objects.active = rig.mesh_object
-
-
 def drain(job: Job[Result], stop_after: int | None = None) -> Result:
     """Run a job to its end and return its result, or close it after a number of steps."""
     if stop_after is None:

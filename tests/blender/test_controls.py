@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import control_face, targets
-from blend_fixtures.characters.bones import NewBone, add_bones, limit
+from blend_fixtures.characters.base import add_key, drive
+from blend_fixtures.characters.bones import NewBone, add_bones, limit, wave
+from blend_fixtures.characters.controls import add_property
 from blend_fixtures.characters.targets import TARGET
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RigError
@@ -28,7 +30,6 @@ from fdda_addon.scene.controls import canonical_path, control_default, is_driven
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW_RIG, assert_plays, run, train
-from .waves import wave
 
 
 @pytest.fixture
@@ -104,10 +105,8 @@ def test_a_driver_reads_the_same_by_numbers_as_by_names(rig, path, bone, control
     aim.constraints.new("LIMIT_SCALE").name = "fix"
     aim["bend [3].x"] = 0.5
     aim.id_properties_ui("bend [3].x").update(min=0, max=1)
-    driver = mesh_object.modifiers.new("Cast", "CAST").driver_add("factor").driver
-    target = driver.variables.new().targets[0]
-    driver.type = "SUM"
-    target.id, target.data_path = armature_object, path.replace("#", str(armature_object.pose.bones.find("aim")))
+    path = path.replace("#", str(armature_object.pose.bones.find("aim")))
+    drive(mesh_object.modifiers.new("Cast", "CAST"), "factor", armature_object, path)
     dependencies = read_dependencies(rig)
     assert dependencies.bones == ({bone} if bone else set())
     assert [c.path for c in dependencies.controls] == ([control] if control else [])
@@ -257,15 +256,6 @@ def test_a_missing_control_bone_is_named(bound_face, change):
     assert "'elbow' lacks the control bone 'eye'; name it as before" in bound_face.fdda.status
 
 
-def test_a_model_of_another_rig_names_the_missing_control_bone(face_folder, tmp_path, capfd):
-    bpy.ops.wm.open_mainfile(filepath=str(face_folder / "face.blend"))
-    bpy.data.objects[control_face.ARMATURE].data.bones["lid"].name = "eyelid"
-    save_copy(tmp_path / "renamed.blend")
-    options = ("bind", tmp_path / "renamed.blend", face_folder / "with.onnx", tmp_path / "out.blend")
-    assert run(*options, "--object", "elbow") == 1
-    assert "'elbow' lacks the control bone 'lid'" in capfd.readouterr().err
-
-
 def test_locked_and_driven_channels_are_left_out(face):
     bones = face.armature_object.pose.bones
     settings = RecordingSettings(extra_inputs=(FACE,))
@@ -279,6 +269,8 @@ def test_locked_and_driven_channels_are_left_out(face):
         listed_controls(face, RecordingSettings(extra_inputs=("bone:still",)))
     with pytest.raises(RigError, match="'elbow_rig' has no bone collection 'Mouth'; its collections: 'Face'"):
         listed_controls(face, RecordingSettings(extra_inputs=("collection:Mouth",)))
+    with pytest.raises(RigError, match="has no bone collection 'Face=0:1'"):
+        listed_controls(face, RecordingSettings(extra_inputs=(f"{FACE}=0:1",)))
 
 
 def test_control_bones_are_posed_besides_the_default_bones(face):
@@ -312,21 +304,6 @@ def test_control_bones_are_posed_besides_the_default_bones(face):
 )
 def test_a_rotation_becomes_two_columns_or_cosine_and_sine(channels, elements):
     assert rotation_elements([Channel("bone", kind, axis, -1.0, 1.0) for kind, axis in channels]) == elements
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_cosine_and_sine_are_read_from_the_matrix(face, axis):
-    lid = face.armature_object.pose.bones["lid"]
-    lid.rotation_euler = (0, 0, 0)
-    lid.rotation_euler[axis] = 0.7
-    names = [
-        f'armature_object/pose.bones["lid"].matrix_basis[{column}][{row}]'
-        for column, row in rotation_elements([Channel("lid", ROTATION, axis, -1.0, 1.0)])
-    ]
-    reader = ControlReader(face, parse_controls(face, names))
-    bpy.context.view_layer.update()
-    values = reader.read(face, bpy.context.evaluated_depsgraph_get())
-    assert values == pytest.approx([np.cos(0.7), np.sin(0.7)], abs=1e-6)
 
 
 def test_constraints_of_control_bones_are_read_unless_drivers_read_the_channels(face):
@@ -379,11 +356,6 @@ def test_sixty_control_bones_are_read_through_sixty_dependencies():
     values = reader.read(rig, bpy.context.evaluated_depsgraph_get())
     locations = [value for control, value in zip(controls, values, strict=True) if control.path.endswith("location[1]")]
     assert locations == pytest.approx(np.arange(60) / 1000)
-
-
-def test_a_collection_takes_no_range(face):
-    with pytest.raises(RigError, match="has no bone collection 'Face=0:1'"):
-        listed_controls(face, RecordingSettings(extra_inputs=(f"{FACE}=0:1",)))
 
 
 def test_custom_properties_without_a_range_are_named(face, capfd):
@@ -440,23 +412,17 @@ def add_slider() -> None:
     """The tube and its target `flesh`, which alone follows the bone `cheek`. That bone follows `slider`."""
     flesh = targets.target_copy()
     armature_object = bpy.data.objects["elbow_rig"]
-    bpy.context.view_layer.objects.active = armature_object
-    bpy.ops.object.mode_set(mode="EDIT")
-    bones = armature_object.data.edit_bones
-    for name, place, parent in (("slider", 0.8, None), ("cheek", 0.35, "lower")):
-        bone = bones.new(name)
-        bone.head, bone.tail = (place, 0, 0), (place, 0, 0.1)
-        bone.parent, bone.use_deform = parent and bones[parent], name == "cheek"
-    bpy.ops.object.mode_set(mode="OBJECT")
+    add_bones(
+        armature_object,
+        NewBone("slider", (0.8, 0, 0), (0.8, 0, 0.1), is_deforming=False),
+        NewBone("cheek", (0.35, 0, 0), (0.35, 0, 0.1), "lower"),
+    )
     near = [vertex.index for vertex in flesh.data.vertices if vertex.co.x > 0.3]
     flesh.vertex_groups.new(name="cheek").add(near, 0.5, "REPLACE")
-    slider, cheek = (armature_object.pose.bones[name] for name in ("slider", "cheek"))
-    follow = cheek.constraints.new("COPY_LOCATION")
+    follow = armature_object.pose.bones["cheek"].constraints.new("COPY_LOCATION")
     follow.target, follow.subtarget, follow.use_offset = armature_object, "slider", True
     follow.owner_space = follow.target_space = "LOCAL"
-    slider.lock_rotation = (True, True, True)
-    limit = slider.constraints.new("LIMIT_LOCATION")
-    limit.owner_space, limit.use_min_x, limit.use_max_x, limit.min_x, limit.max_x = "LOCAL", True, True, -0.05, 0.05
+    limit(armature_object.pose.bones["slider"], "LIMIT_LOCATION", {0: (-0.05, 0.05)})
 
 
 def recorded(tmp_path: Path, *options: object) -> Recording:
@@ -498,15 +464,11 @@ def keyed_smile() -> None:
     """The tube and its target, whose shape key follows a property of the armature that the action keys."""
     flesh = targets.target_copy()
     armature_object = bpy.data.objects["elbow_rig"]
-    armature_object["smile"] = 0.0
-    armature_object.id_properties_ui("smile").update(min=0.0, max=1.0)
-    flesh.shape_key_add(name="Basis")
-    key = flesh.shape_key_add(name="smile")
-    for point in key.data[: len(key.data) // 2]:
-        point.co.z += 0.05
-    variable = key.driver_add("value").driver.variables.new()
-    variable.name, variable.targets[0].id, variable.targets[0].data_path = "smile", armature_object, '["smile"]'
-    key.id_data.animation_data.drivers[0].driver.expression = "smile"
+    add_property(armature_object, "smile")
+    key = add_key(
+        flesh, "smile", lambda points: points + [(0, 0, 0.05 * (n < len(points) // 2)) for n in range(len(points))]
+    )
+    drive(key, "value", armature_object, '["smile"]')
     for frame, value in ((1, 0.0), (20, 1.0)):
         armature_object["smile"] = value
         armature_object.keyframe_insert('["smile"]', frame=frame)

@@ -9,8 +9,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
+import numpy as np
 import pytest
 
+from blend_fixtures.characters.base import BEND, add_key, drive
 from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.progress import run_job
@@ -88,10 +90,7 @@ def test_the_parts_add_up_to_the_frame_and_the_slow_modifier_is_the_largest(slow
 
 
 def test_shape_keys_and_their_drivers_are_parts(slow_rig):
-    slow_rig.mesh_object.shape_key_add(name="Basis")
-    driver = slow_rig.mesh_object.shape_key_add(name="bulge").driver_add("value").driver
-    target = driver.variables.new().targets[0]
-    target.id, target.data_path = slow_rig.armature_object, 'pose.bones["lower"].rotation_euler[0]'
+    drive(add_key(slow_rig.mesh_object, "bulge", np.copy), "value", slow_rig.armature_object, BEND)
     before = scene_state(slow_rig)
     profile = profile_of(slow_rig)
     assert_same_state(before, scene_state(slow_rig))
@@ -177,16 +176,6 @@ def test_a_profile_takes_no_model(elbow_files, tmp_path, capfd, arguments):
     assert "--profile and --fast-rig take no model" in capfd.readouterr().err
 
 
-def test_the_button_stores_the_profile(slow_rig):
-    hide_extra_bones(slow_rig)
-    assert measurements.last(measurements.PROFILE, slow_rig.armature_object) is None
-    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
-    assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
-    assert profile.fast_rig.full > profile.fast_rig.fast
-    assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
-
-
 def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):
     bpy.context.view_layer.objects.active = bound_elbow
     assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
@@ -199,34 +188,35 @@ def test_a_bound_model_does_not_play_while_its_rig_is_profiled(bound_elbow):
     assert parts == {"Armature", "CorrectiveSmooth"}
 
 
-def test_the_sidebar_draws_a_bar_with_the_shares(slow_rig):
-    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile, drawn = measurements.last(measurements.PROFILE, slow_rig.armature_object), []
+def drawn_texts(rig: SceneRig) -> list[str]:
+    drawn = []
     context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
-    draw_profile(Layout(drawn), context, slow_rig)
-    texts = [element.text for element in drawn]
+    draw_profile(Layout(drawn), context, rig)
+    return [element.text for element in drawn]
+
+
+def test_the_button_stores_the_profile_and_the_sidebar_draws_a_bar_with_the_shares(slow_rig, monkeypatch):
+    hide_extra_bones(slow_rig)
+    assert measurements.last(measurements.PROFILE, slow_rig.armature_object) is None
+    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
+    profile = measurements.last(measurements.PROFILE, slow_rig.armature_object)
+    assert (profile.fast_rig.bones, profile.fast_rig.kept_bones) == (14, 2) and not profile.fast_rig_problem
+    assert profile.fast_rig.full > profile.fast_rig.fast
+    assert len(slow_rig.armature_object.data.bones) == 14, "only a copy was pruned"
+    texts = drawn_texts(slow_rig)
     assert f"Frame Profile ({profile.total:.1f} ms)" in texts
     assert job.state_of("profile_frame").outcome.startswith(f"A frame takes {profile.total:.2f} ms; ")
-    share = profile.parts[0].duration.median / profile.total
-    assert f"A {share:.0%} {profile.parts[0].duration} ms {profile.parts[0].title}" in " ".join(" ".join(texts).split())
+    part, share = f"{profile.parts[0].duration} ms {profile.parts[0].title}", profile.parts[0].duration.median
+    assert f"A {share / profile.total:.0%} {part}" in " ".join(" ".join(texts).split())
     segments = [text for text in texts if text in {"A", "B", "C", "D"}]
     wide_parts = sum(part.duration.median >= 0.05 * profile.total for part in profile.parts)
     assert "".join(segments) == "ABCD"[:wide_parts]
     sentences = profile.savings_sentences()
     assert len(sentences) == 3
     assert all(sentence.split(" ms")[0] in " ".join(texts) for sentence in sentences)
-
-
-def test_slow_drawing_hides_no_part(slow_rig, monkeypatch):
-    """Without a graphics card, drawing takes a hundred times as long as the rig."""
-    assert bpy.ops.fdda.profile_frame() == {"FINISHED"}
-    profile, drawn = measurements.last(measurements.PROFILE, slow_rig.armature_object), []
+    # Without a graphics card, drawing takes a hundred times as long as the rig. It hides no part.
     drawing = FramePart(DRAWING, "", "", Duration(1000 * profile.frame.median, 0.0))
-    slow = replace(profile, parts=(*profile.parts, drawing))
-    monkeypatch.setattr(measurements, "last", lambda *_: slow)
-    context = SimpleNamespace(region=SimpleNamespace(width=300), preferences=bpy.context.preferences)
-    draw_profile(Layout(drawn), context, slow_rig)
-    texts = [element.text for element in drawn]
-    drawn_text = " ".join(" ".join(texts).split())
-    assert f"A <1% {profile.parts[0].duration} ms {profile.parts[0].title}" in drawn_text
+    monkeypatch.setattr(measurements, "last", lambda *_: replace(profile, parts=(*profile.parts, drawing)))
+    drawn_text = " ".join(" ".join(drawn_texts(slow_rig)).split())
+    assert f"A <1% {part}" in drawn_text
     assert f" {drawing.duration} ms Drawing" in drawn_text

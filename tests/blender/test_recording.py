@@ -12,7 +12,7 @@ import pytest
 from mathutils import Matrix
 
 from blend_fixtures.characters import meshes
-from blend_fixtures.characters.base import tube
+from blend_fixtures.characters.base import add_key, drive, tube
 from blend_fixtures.characters.bones import (
     NewBone,
     add_bone_collection,
@@ -88,20 +88,6 @@ def test_positions_are_those_that_blender_shows(fresh, tmp_path):
     assert len({pose.tobytes() for pose in recording.pose_matrices[:12]}) == 12
 
 
-def test_objects_with_different_transforms(fresh, tmp_path):
-    """Pose matrices are in the space of the mesh object, for any transforms of the two objects."""
-    fresh.mesh_object.parent = None
-    fresh.mesh_object.location, fresh.mesh_object.rotation_euler = (0.3, -0.2, 0.1), (0.2, 0.4, -0.3)
-    fresh.armature_object.location, fresh.armature_object.rotation_euler = (-0.5, 0.1, 0.9), (1.0, 0.2, 0)
-    fresh.armature_object.scale = (1.5, 1.5, 1.5)
-    recording = recorded(fresh, tmp_path / "r", poses=6)
-    fresh.armature_object.animation_data_clear()
-    assert_reproduces(fresh, recording, (random_pose(fresh, recording, index) for index in (0, 5)))
-    to_mesh = fresh.mesh_object.matrix_world.inverted() @ fresh.armature_object.matrix_world
-    expected = np.array(to_mesh @ fresh.armature_object.pose.bones["lower"].matrix)
-    np.testing.assert_allclose(recording.pose_matrices[5, 1], expected, atol=1e-5)
-
-
 def test_influences_of_the_elbow(fresh, tmp_path):
     """The bend of the lower bone affects the upper half, and the rotation of the upper bone affects no residual."""
     recording = recorded(fresh, tmp_path / "r", poses=3)
@@ -127,19 +113,8 @@ def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
 
 def test_influences_include_distant_vertices(fresh, tmp_path):
     """The upper bone drives a shape key of the lower half, whose value influences the lower half only."""
-    mesh = fresh.mesh_object.data
-    fresh.mesh_object.shape_key_add(name="Basis")
-    key = fresh.mesh_object.shape_key_add(name="bump")
-    for vertex in mesh.vertices:
-        if vertex.co.x > 0.45:
-            key.data[vertex.index].co.y += 0.02
-    driver = key.driver_add("value").driver
-    variable = driver.variables.new()
-    variable.type = "TRANSFORMS"
-    variable.targets[0].id = fresh.armature_object
-    variable.targets[0].bone_target = "upper"
-    variable.targets[0].transform_type, variable.targets[0].transform_space = "ROT_Z", "LOCAL_SPACE"
-    driver.expression = "var"
+    key = add_key(fresh.mesh_object, "bump", lambda points: points + np.outer(points[:, 0] > 0.45, (0, 0.02, 0)))
+    drive(key, "value", fresh.armature_object, ("upper", "ROT_Z"))
     recording = recorded(fresh, tmp_path / "r", poses=3)
     partitions = skin_recording(recording).partitions
     assert [(p.joint, p.influencing, p.controls) for p in partitions] == [(0, (1,), ()), (1, (1,), (0,))]
@@ -284,32 +259,22 @@ def test_an_object_scaled_to_nothing_is_named(fresh, tmp_path, name):
         recorded(fresh, tmp_path / "r", poses=3)
 
 
-def chains() -> None:
-    """Build six chains of eight bones, which do not meet."""
-    meshes.five_hundred_bones()
-
-
 def chains_with_distant_influences() -> None:
     """Let the first bone of each chain drive a shape key of the next chain."""
-    chains()
+    meshes.five_hundred_bones()
     mesh_object, armature_object = bpy.data.objects["creature"], bpy.data.objects["creature_rig"]
-    mesh_object.shape_key_add(name="Basis", from_mix=False)
     points = np.array([vertex.co for vertex in mesh_object.data.vertices])
     for chain in range(meshes.CHAINS):
-        key = mesh_object.shape_key_add(name=f"key {chain}", from_mix=False)
+        offsets = np.outer(np.abs(points[:, 1] - chain * 0.05) < 0.02, (0.0, 0.0, 0.05))
+        key = add_key(mesh_object, f"key {chain}", offsets.__add__)
         key.slider_min = -1.0
-        for point, is_moved in zip(key.data, np.abs(points[:, 1] - chain * 0.05) < 0.02, strict=True):
-            point.co.z += 0.05 if is_moved else 0.0
-        driver = key.driver_add("value").driver
-        driver.type = "SUM"
-        target = driver.variables.new().targets[0]
-        target.id = armature_object
-        target.data_path = f'pose.bones["finger.{(chain - 1) % meshes.CHAINS:02}.00"].rotation_euler[0]'
+        path = f'pose.bones["finger.{(chain - 1) % meshes.CHAINS:02}.00"].rotation_euler[0]'
+        drive(key, "value", armature_object, path)
 
 
 def chains_on_controls() -> None:
     """Let control bones move all chains: the poses come from IK, a copied rotation and a control of all of them."""
-    chains()
+    meshes.five_hundred_bones()
     armature_object = bpy.data.objects["creature_rig"]
     names = [f"control.{chain}" for chain in range(meshes.CHAINS)]
     add_bones(
@@ -335,7 +300,11 @@ def chains_on_controls() -> None:
 
 @pytest.mark.parametrize(
     ("build", "sample"),
-    [(chains, ()), (chains_with_distant_influences, ()), (chains_on_controls, ("collection:Controls",))],
+    [
+        (meshes.five_hundred_bones, ()),
+        (chains_with_distant_influences, ()),
+        (chains_on_controls, ("collection:Controls",)),
+    ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
 def test_joints_influence_their_chain_and_shape_keys_what_they_move(

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 import pytest
 
+from blend_fixtures.characters.bones import NewBone, add_bones
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.formats.model import read_model_info
@@ -81,13 +82,9 @@ class TestSmallPartitions:
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Path:
         elbow, rig = build_elbow()
-        bpy.context.view_layer.objects.active = rig
-        bpy.ops.object.mode_set(mode="EDIT")
-        for name, parent in (("tip", "lower"), ("nail", "tip")):
-            bone = rig.data.edit_bones.new(name)
-            bone.head, bone.tail = (0.48, 0, 0), (0.5, 0, 0)
-            bone.parent = rig.data.edit_bones[parent]
-        bpy.ops.object.mode_set(mode="OBJECT")
+        add_bones(
+            rig, *(NewBone(n, (0.48, 0, 0), (0.5, 0, 0), parent) for n, parent in (("tip", "lower"), ("nail", "tip")))
+        )
         last = [v.index for v in elbow.data.vertices if v.co.x > 0.499]
         assert len(last) == 12
         for name, indices in (("tip", last[3:]), ("nail", last[:3])):

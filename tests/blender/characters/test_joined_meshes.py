@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import fdda_addon
-from blend_fixtures.characters.base import cage, link, skin
+from blend_fixtures.characters.base import cage, link
 from blend_fixtures.characters.meshes import dressed_limb
+from blend_fixtures.elbow import skin
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.formats.report import read_report
 from fdda_addon.core.recording.index import read_index
@@ -24,8 +25,7 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_whole_character
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
-from ..command_output import CommandOutput, output_of
-from ..conftest import run
+from ..conftest import CommandOutput, output_of, run
 from ..refusals import Refusal, file_contents
 
 BODY, SLEEVE, CUFF = NAMES = ("elbow", "sleeve", "cuff")

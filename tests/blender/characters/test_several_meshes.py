@@ -13,8 +13,7 @@ import fdda_addon
 from blend_fixtures.characters.meshes import body_and_sleeve
 from fdda_addon.scene.blend_file import save_copy
 
-from ..command_output import CommandOutput, output_of
-from ..conftest import assert_plays, pose, run
+from ..conftest import CommandOutput, assert_plays, output_of, pose, run
 from ..refusals import Refusal, file_contents
 
 BODY, SLEEVE = "elbow", "sleeve"

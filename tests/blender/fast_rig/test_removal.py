@@ -5,8 +5,8 @@ import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters.base import link
-from blend_fixtures.characters.bones import NewBone, add_bones
+from blend_fixtures.characters.base import drive, link
+from blend_fixtures.characters.bones import NewBone, add_bones, wave
 from blend_fixtures.characters.dependencies import CONTROLS, DEPENDENCIES, SOURCE, UNUSED, studio_arm
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.progress import run_job
@@ -15,7 +15,6 @@ from fdda_addon.fast_rig.controls import control_bones
 from fdda_addon.fast_rig.graph_reader import read_graph, shown_objects
 from fdda_addon.fast_rig.object_values import differing_objects, driven_properties
 from fdda_addon.fast_rig.removal import remove_bones, remove_drivers, remove_unneeded
-from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.rig.references import Node
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.compatibility import animation_curves
@@ -23,7 +22,6 @@ from fdda_addon.scene.node_groups import BONE_NODE
 from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import ELBOW
-from ..waves import wave
 
 REPLACED = {ELBOW: {"Armature", "Mush", "Lattice"}}
 
@@ -33,6 +31,12 @@ SIZE = 0.5
 """Length of the arm, meters."""
 
 BENDY, HANDLE = "bendy", "handle"
+
+
+@pytest.fixture
+def scene_rig() -> SceneRig:
+    """An arm with a control bone, a bone that nothing needs, and modifiers that a model replaces."""
+    return SceneRig(*studio_arm())
 
 
 def kept_for_joints(scene_rig: SceneRig) -> tuple[set[Node], set[Node]]:
@@ -65,24 +69,6 @@ def test_a_joint_keeps_the_bones_that_it_depends_on(name):
     assert remove_bones(armature_object, missing) == [source]
     _, broken = joint_matrices(scene_rig, "control")
     assert differing_bones(poses, full, broken, 1e-3).keys() == {"lower"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "object_property", "bone_property"),
-    [
-        ("HOOK", "object", "subtarget"),
-        ("WARP", "object_from", "bone_from"),
-        ("WAVE", "start_position_object", ""),
-        ("DISPLACE", "texture_coords_object", "texture_coords_bone"),
-        ("UV_WARP", "object_to", "bone_to"),
-    ],
-)
-def test_a_mesh_depends_on_the_bones_that_its_modifiers_name(kind, object_property, bone_property, scene_rig):
-    modifier = scene_rig.mesh_object.modifiers.new("Modifier", kind)
-    setattr(modifier, object_property, scene_rig.armature_object)
-    if bone_property:
-        setattr(modifier, bone_property, UNUSED)
-    assert (UNUSED in read_dependencies(scene_rig).bones) == bool(bone_property)
 
 
 def test_a_bone_keeps_the_bone_at_which_its_custom_shape_is_drawn(scene_rig):
@@ -118,27 +104,12 @@ def test_control_bones_are_visible_or_keyed_or_in_a_collection():
         control_bones(armature_object, ["visible", "collection:Empty"])
 
 
-def test_a_driven_property_of_the_scene_is_followed():
-    scene_rig = SceneRig(*studio_arm("target"))
-    armature_object, scene = scene_rig.armature_object, bpy.context.scene
-    scene["bend"] = 0.0
-    for owner, target_id, path in (
-        (scene.driver_add('["bend"]'), armature_object, f'pose.bones["{UNUSED}"].location[0]'),
-        (armature_object.pose.bones["lower"].driver_add("rotation_euler", 0), scene, '["bend"]'),
-    ):
-        owner.driver.type = "SUM"
-        target = owner.driver.variables.new().targets[0]
-        target.id_type = target_id.id_type
-        target.id, target.data_path = target_id, path
-    assert Node(armature_object, UNUSED) in kept_for_joints(scene_rig)[1]
-
-
 def test_the_drivers_of_the_world_keep_their_bones(scene_rig):
     """A fast rig may be rendered from its own file, too."""
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
-    drive(world, "color", scene_rig.armature_object, f'pose.bones["{UNUSED}"].location[0]')
+    drive(world, "color", scene_rig.armature_object, f'pose.bones["{UNUSED}"].location[0]', index=0)
     removed = remove_unneeded([scene_rig], ["lower"], ["control"])
-    assert removed.bones == {f"{UNUSED}_child"} and len(world.animation_data.drivers) == 3
+    assert removed.bones == {f"{UNUSED}_child"} and len(world.animation_data.drivers) == 1
 
 
 @pytest.mark.parametrize("expression", ['self.id_data["bend"]', 'self["bend"]'])
@@ -330,15 +301,6 @@ def test_actions_that_only_removed_objects_use_are_saved(tmp_path, scene_rig):
     assert "cage" not in bpy.data.objects and "of the cage" in bpy.data.actions
 
 
-def drive(struct: bpy.types.bpy_struct, name: str, target_id: bpy.types.ID, path: str) -> None:
-    """Set the first element of a property to the value at a path of a datablock."""
-    curves = struct.driver_add(name)
-    driver = (curves[0] if isinstance(curves, list) else curves).driver
-    driver.expression = "var > 0.1" if name == "hide_render" else "var"
-    target = driver.variables.new().targets[0]
-    target.id, target.data_path = target_id, path
-
-
 class NamedBone(bpy.types.PropertyGroup):
     """What an add-on may store with an object."""
 
@@ -448,13 +410,13 @@ def test_paths_with_numbers_lead_to_the_same_elements_afterwards(scene_rig):
     # Of the three bones without weights, only the first is no control.
     number = bones.find(UNUSED)
     prop = add_mesh_object("prop")
-    drive(prop, "location", armature_object, f"pose.bones[{number}].constraints[1].influence")
-    drive(bones[UNUSED], "scale", armature_object, 'pose.bones["control"].location[0]')
+    drive(prop, "location", armature_object, f"pose.bones[{number}].constraints[1].influence", index=0)
+    drive(bones[UNUSED], "scale", armature_object, 'pose.bones["control"].location[0]', index=0)
     for curve in (*animation_curves(action), *armature_object.animation_data.drivers):
         curve.data_path = curve.data_path.replace(f'["{UNUSED}"]', f"[{number}]")
     add_mesh_object("another")
     removed = remove_unneeded([scene_rig], ["lower"], ["upper"])
-    assert removed.bones == {f"{UNUSED}_child"} and len(armature_object.animation_data.drivers) == 3
+    assert removed.bones == {f"{UNUSED}_child"} and len(armature_object.animation_data.drivers) == 1
     path = f'pose.bones["{UNUSED}"]'
     assert {curve.data_path for curve in animation_curves(action)} == {f"{path}.rotation_euler"}
     target = prop.animation_data.drivers[0].driver.variables[0].targets[0]
@@ -466,7 +428,7 @@ def test_paths_with_numbers_lead_to_the_same_elements_afterwards(scene_rig):
 def test_modifiers_whose_settings_drivers_read_stay_and_are_read(scene_rig):
     mesh_object, prop = scene_rig.mesh_object, add_mesh_object("prop")
     mesh_object.modifiers["Mush"].factor = 0.7
-    drive(prop, "location", mesh_object, 'modifiers["Mush"].factor')
+    drive(prop, "location", mesh_object, 'modifiers["Mush"].factor', index=0)
     assert remove_unneeded([scene_rig], ["lower"], ["control"]).modifiers == ("Lattice",)
     bpy.context.view_layer.update()
     assert prop.location.x == pytest.approx(0.7)
@@ -474,7 +436,8 @@ def test_modifiers_whose_settings_drivers_read_stay_and_are_read(scene_rig):
 
 def test_a_driver_that_reads_if_a_replaced_modifier_is_on_is_refused(scene_rig):
     """A model turns it off, so the object would be somewhere else."""
-    drive(add_mesh_object("prop"), "location", scene_rig.mesh_object, 'modifiers["Mush"].show_viewport')
+    prop = add_mesh_object("prop")
+    drive(prop, "location", scene_rig.mesh_object, 'modifiers["Mush"].show_viewport', index=0)
     with pytest.raises(RigError, match="A driver reads if the modifier 'Mush' of 'elbow' is on, but a model turns it"):
         remove(scene_rig)
 
@@ -499,7 +462,7 @@ def add_readers_of_unused(armature_object: bpy.types.Object) -> set[str]:
     armature_object.data.bones[UNUSED].use_deform = True
     props["skinned"].vertex_groups.new(name=UNUSED).add([0], 1.0, "REPLACE")
     props["skinned"].modifiers.new("Armature", "ARMATURE").object = armature_object
-    drive(props["seen"], "hide_render", armature_object, path)
+    drive(props["seen"], "hide_render", armature_object, path, "value > 0.1")
     for owner in (props["wet"], props["wet data"].data):
         owner["wetness"] = 0.0
         drive(owner, '["wetness"]', armature_object, path)
@@ -521,7 +484,7 @@ def add_readers_of_unused(armature_object: bpy.types.Object) -> set[str]:
     light, scene.world = bpy.data.lights.new("lamp", "POINT"), bpy.data.worlds.new("sky")
     link(bpy.data.objects.new("lamp", light))
     drive(light, "energy", armature_object, path)
-    drive(scene.world, "color", armature_object, path)
+    drive(scene.world, "color", armature_object, path, index=0)
     instance, source = link(bpy.data.objects.new("instance", None)), bpy.data.objects.new("source", curve)
     source.parent, source.parent_type, source.parent_bone = armature_object, "BONE", UNUSED
     instance.instance_type, instance.instance_collection = "COLLECTION", bpy.data.collections.new("instances")

@@ -17,7 +17,7 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
-from ..conftest import evaluated_positions, run, train
+from ..conftest import Trained, build_and_train, evaluated_positions, run
 from ..figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, key_channel
 from ..refusals import file_contents
 from ..scene_state import assert_same_state, drain, scene_state
@@ -179,24 +179,19 @@ def test_resumed_recordings_have_the_same_bytes_and_restore_the_scene(figure, tm
 
 
 @pytest.fixture(scope="module")
-def trained_folder(tmp_path_factory):
-    """Return a folder with a figure and a model that was trained on its action alone."""
-    import fdda_addon
+def trained(tmp_path_factory) -> Trained:
+    """The figure with a model that was trained on its action alone."""
 
-    folder = tmp_path_factory.mktemp("figure")
-    fdda_addon.register()
-    rig = build_figure()
-    add_wave(rig)
-    add_strips(rig, bpy.data.actions[WAVE])
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure.blend"))
+    def build() -> None:
+        rig = build_figure()
+        add_strips(rig, add_wave(rig))
+
     options = ("--poses", 0, "--action", WAVE)
-    assert run("record", folder / "figure.blend", folder / "recording", *options) == 0
-    train(folder / "recording", folder / "figure.onnx", "--passes", 30)
-    return folder
+    return build_and_train(tmp_path_factory.mktemp("figure"), build, *options, training=("--passes", 30))
 
 
-def test_with_0_poses_the_report_shows_the_errors_of_the_first_action(trained_folder, tmp_path, capsys):
-    files = (trained_folder / "figure.blend", trained_folder / "figure.onnx", "--json", tmp_path / "errors.json")
+def test_with_0_poses_the_report_shows_the_errors_of_the_first_action(trained, tmp_path, capsys):
+    files = (trained.rig, trained.model, "--json", tmp_path / "errors.json")
     assert run("evaluate", *files, "--poses", 0, "--action", WAVE, "--strip", "swing") == 0
     report, table = json.loads((tmp_path / "errors.json").read_text()), capsys.readouterr().out
     assert report["poses"] == FRAMES and [a["name"] for a in report["actions"]] == [WAVE, "swing"]
@@ -208,14 +203,11 @@ def test_with_0_poses_the_report_shows_the_errors_of_the_first_action(trained_fo
         assert "With --poses 0 only actions and strips are compared; give --action" in capsys.readouterr().err
 
 
-def test_evaluation_of_an_action_needs_no_range_of_motion(trained_folder):
-    bpy.ops.wm.open_mainfile(filepath=str(trained_folder / "figure.blend"))
-    rig = SceneRig(bpy.data.objects["body"], bpy.data.objects["figure_rig"])
+def test_evaluation_of_an_action_needs_no_range_of_motion(trained):
+    rig = trained.open()
     for bone in rig.armature_object.pose.bones:
         bone.lock_rotation = (True, True, True)
-    evaluation = run_job(
-        evaluate(rig, trained_folder / "figure.onnx", EvaluationSettings(0, actions=(WAVE,), surface=False))
-    )
+    evaluation = run_job(evaluate(rig, trained.model, EvaluationSettings(0, actions=(WAVE,), surface=False)))
     assert evaluation.held_out is evaluation.actions[0] and evaluation.held_out.name == WAVE
     with pytest.raises(RigError, match="nothing to evaluate: 0 poses and no action; give --poses or --action"):
-        drain(evaluate(rig, trained_folder / "figure.onnx", EvaluationSettings(0)))
+        drain(evaluate(rig, trained.model, EvaluationSettings(0)))

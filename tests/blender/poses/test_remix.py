@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.characters import control_rigs
-from blend_fixtures.characters.controls import add_key, drive_by_property
+from blend_fixtures.characters.base import add_key, drive
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.mathematics.poses import CONTROL, LOCATION, ROTATION_VECTOR
 from fdda_addon.core.recording.index import read_index, read_info
@@ -167,7 +167,7 @@ def test_keys_and_bones_that_act_through_keys_alone_may_rest(bones, names):
     scene_rig = find_rig()
     add_key(scene_rig.mesh_object, "pout", lambda points: points * 1.01)
     corrective = add_key(scene_rig.mesh_object, "corrective", lambda points: points * 0.99)
-    drive_by_property(corrective, "value", scene_rig.armature_object, 'pose.bones["upper"].rotation_euler[0]')
+    drive(corrective, "value", scene_rig.armature_object, 'pose.bones["upper"].rotation_euler[0]')
     _, channels = read_sampled_rig(scene_rig, RecordingSettings(bones_to_pose=bones))
     assert {channel.name for channel in channels if channel.is_key} == {
         "slider",

@@ -16,8 +16,7 @@ from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
-from ..crowds import crowd_of
-from ..evaluations import add_shape_key
+from ..playback import add_shape_key, crowd_of
 from ..rig_changes import (
     EDIT_MODE_CHANGES,
     REST_POSE_OF,

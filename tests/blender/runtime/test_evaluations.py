@@ -11,7 +11,7 @@ from fdda_addon.runtime.depsgraph_changes import seen_mode
 from fdda_addon.runtime.session import session
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
-from ..evaluations import add_shape_key, handler, shown_in
+from ..playback import add_shape_key, handler, shown_in
 from ..rendering import rig_pixels, set_camera, still
 
 FRAMES = (4, 11, 20)

@@ -16,7 +16,6 @@ from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.session import session
 
 from ..conftest import ADDED, ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, predicted_positions
-from ..crowds import animate, count_calls
 from ..linked import (
     ANGLES,
     COLLECTION,
@@ -35,6 +34,7 @@ from ..linked import (
     save_new_shot,
     shot_path,
 )
+from ..playback import animate, count_calls
 from ..rendering import render_positions, rig_pixels, set_camera, still
 
 CROWD_SIZE = 20

@@ -18,7 +18,7 @@ from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from ..baked_files import read_baked
 from ..conftest import ELBOW, assert_plays, evaluated_positions, pose
-from ..crowds import animate, crowd_of
+from ..playback import animate, crowd_of
 from ..scene_state import drain
 
 GROUP = "learned"

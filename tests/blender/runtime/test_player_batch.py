@@ -15,7 +15,7 @@ from fdda_addon.runtime.session import session
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
 from ..conftest import ELBOW, assert_plays, evaluated_positions, predicted_positions, run, train
-from ..crowds import animate, count_calls, crowd_of
+from ..playback import animate, count_calls, crowd_of
 
 ROOT = Path(__file__).resolve().parents[3]
 CROWD = 20

@@ -35,8 +35,7 @@ from ..conftest import (
     rig_positions,
     write_edited,
 )
-from ..crowds import crowd_of
-from ..evaluations import handler
+from ..playback import crowd_of, handler
 from ..rendering import FRAME, animation, set_camera
 from ..rig_changes import change_in_edit_mode
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
-from ..evaluations import add_shape_key, handler
+from ..playback import add_shape_key, handler
 from ..rendering import FRAME, animation, render_positions, rig_pixels, set_camera, still
 
 

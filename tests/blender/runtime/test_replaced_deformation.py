@@ -15,6 +15,7 @@ from fdda_addon.scene.compatibility import node_input_settings
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
+from ..playback import add_shape_key
 from ..rig_changes import drive_b_bone, trigger_check
 
 
@@ -69,6 +70,7 @@ def add_weights(mesh_object: bpy.types.Object) -> None:
 
 
 GONE = "is gone, switched off or behind the modifier FDDA"
+
 CHANGES = {
     "a subdivision first": (add("SUBSURF", 0, levels=1), "it was recorded without the modifier 'Subsurf'"),
     "a mirror": (add("MIRROR", 1), "it was recorded without the modifier 'Mirror'"),
@@ -196,6 +198,7 @@ def make_relative(mesh_object: bpy.types.Object) -> None:
 
 
 KEY = "shape key 'bulge'"
+
 KEY_CHANGES = {
     "another shape": (sculpt, f"'shape' of the {KEY} differs"),
     "a muted key": (lambda o: setattr(bulge_of(o), "mute", True), f"'mute' of the {KEY}"),
@@ -277,6 +280,7 @@ def set_values(mesh_object: bpy.types.Object, name: str) -> None:
 
 
 READS, LAYER = "'Socket_2_attribute' of the modifier 'GN' was mask and is", "the attribute or vertex group"
+
 ATTRIBUTES = {
     "its value": (lambda o, m, i: set_attribute(m, i, ""), f"{READS} empty"),
     "another": (lambda o, m, i: set_attribute(m, i, "other"), f"{READS} other"),
@@ -341,3 +345,63 @@ def test_a_driven_setting_of_a_b_bone_follows_the_pose(rig, elbow_files):
     bone.bbone_easeout = 0.5
     trigger_check("view layer")
     assert_shows_rig(rig.mesh_object, "'easeout' of the bone 'lower' was 1.0 and is 0.5")
+
+
+def test_shape_keys_are_restored_with_the_rig(bound_elbow, elbow_files):
+    add_shape_key(bound_elbow)
+    pose(angle=1.1)
+    assert_plays(bound_elbow, elbow_files.model)
+    shown = rig_positions(bound_elbow)
+    bound_elbow.data.shape_keys.key_blocks["bulge"].value = 0
+    bpy.context.view_layer.update()
+    assert_plays(bound_elbow, elbow_files.model)
+    assert np.abs(rig_positions(bound_elbow) - shown).max() > 1e-3
+    assert not bound_elbow.show_only_shape_key and not any(key.mute for key in bound_elbow.data.shape_keys.key_blocks)
+
+
+def test_shape_keys_are_not_mixed_while_a_model_plays(bound_elbow):
+    add_shape_key(bound_elbow)
+    bulge = bound_elbow.data.shape_keys.key_blocks["bulge"]
+
+    def muted() -> list[bool]:
+        keys = bound_elbow.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.shape_keys
+        return [key.mute for key in keys.key_blocks]
+
+    for angle, value in ((0.4, 1.0), (0.8, 1.0), (0.8, 0.5), (1.2, 0.5)):
+        bulge.value = value
+        pose(angle=angle)
+        # What was set has been copied anew.
+        pose(angle=angle + 0.01)
+        assert muted() == [True] * len(bound_elbow.data.shape_keys.key_blocks)
+    bound_elbow.fdda.mode = "RIG"
+    bpy.context.view_layer.update()
+    bulge.value = 1.0
+    bpy.context.view_layer.update()
+    assert not any(muted())
+
+
+def test_an_undeformed_shape_key_added_during_playback_is_muted(bound_elbow, elbow_files):
+    pose(angle=0.3)
+    assert_plays(bound_elbow, elbow_files.model)
+    bound_elbow.shape_key_add(name="Basis")
+    # A new key displaces no vertex, so the model still plays.
+    bound_elbow.shape_key_add(name="bulge").value = 1
+    for angle in (0.5, 0.7, 0.9):
+        pose(angle=angle)
+    keys = bound_elbow.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.shape_keys
+    assert [key.mute for key in keys.key_blocks] == [True, True]
+    assert_plays(bound_elbow, elbow_files.model)
+
+
+def test_shape_keys_of_two_objects(bound_elbow, elbow_files):
+    """Two objects share a mesh: one plays the model and the other shows the rig."""
+    add_shape_key(bound_elbow)
+    pose(angle=0.9)
+    expected = rig_positions(bound_elbow)
+    other = bound_elbow.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.fdda.mode = "RIG"
+    for angle in (1.4, 0.9):
+        pose(angle=angle)
+    assert np.abs(evaluated_positions(other) - expected).max() < 1e-6
+    assert_plays(bound_elbow, elbow_files.model)

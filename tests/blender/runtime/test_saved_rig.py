@@ -13,7 +13,7 @@ from fdda_addon.operators import clipboard
 from fdda_addon.runtime import gltf_export, playback
 
 from ..conftest import ADDED, ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose
-from ..evaluations import add_shape_key
+from ..playback import add_shape_key
 
 
 @pytest.fixture

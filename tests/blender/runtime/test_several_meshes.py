@@ -22,19 +22,19 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import armature_of, find_rig
 
 from ..baked_files import import_baked, world_positions
-from ..command_output import output_of
 from ..conftest import (
     ELBOW,
     ELBOW_RIG,
     assert_plays,
     evaluated_positions,
+    output_of,
     pose,
     predicted_positions,
     rig_positions,
     run,
     train,
 )
-from ..crowds import count_calls
+from ..playback import count_calls
 from ..rendering import set_camera, still
 
 SLEEVE, CUFF = "sleeve", "cuff"

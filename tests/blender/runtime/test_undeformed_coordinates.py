@@ -8,8 +8,8 @@ import pytest
 from fdda_addon.runtime.binding import unbind
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose
-from ..evaluations import add_shape_key
 from ..linked import overridden_meshes
+from ..playback import add_shape_key
 
 
 class CoordinateEngine(bpy.types.RenderEngine):

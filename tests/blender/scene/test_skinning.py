@@ -148,15 +148,3 @@ def test_a_rig_read_with_its_own_joints_is_the_same(smooth: bpy.types.Object):
     first = read_rig(find_rig())
     again = read_rig(find_rig(), first.joint_names)
     assert again.joints == first.joints and again.meshes[0].fingerprint == first.meshes[0].fingerprint
-
-
-def test_envelopes_are_those_of_blender(smooth: bpy.types.Object):
-    """Compare the formula with Blender's own function at each point."""
-    from fdda_addon.scene.skin import _envelope
-
-    envelopes(smooth)
-    bone = armature_of(smooth).bones["upper"]
-    points = np.random.default_rng(0).uniform(-0.3, 0.6, (200, 3))
-    expected = [bone.evaluate_envelope(point) for point in points]
-    assert 0 < np.count_nonzero(expected) < 200
-    assert np.allclose(_envelope(bone, points), expected, atol=1e-5)

@@ -1,71 +1,209 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Models of key joints: choice, training, playback, fast rigs, the sidebar, and errors."""
+"""Models with fitted skin weights, of all bones or of key joints: training, playback, fast rigs, the sidebar."""
 
 import dataclasses
+import json
 import shutil
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.characters.bones import NewBone, add_bones, limit
-from blend_fixtures.characters.key_joints import HELPERS, MAIN_BONES, limb_of_free_bones, limb_with_helpers
+from blend_fixtures.characters import stacks
+from blend_fixtures.characters.base import drive
+from blend_fixtures.characters.bones import NewBone, add_bones, add_delta_mush, add_smooth_weights, limb, limit, wave
+from blend_fixtures.elbow import END, START, build_elbow, lower_weights
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.formats.model import read_model_info
 from fdda_addon.core.formats.model_info import ModelInfo
 from fdda_addon.core.mathematics.key_joints import find_unread_bones
 from fdda_addon.core.mathematics.skin_fit import SkinFit
+from fdda_addon.core.mathematics.skinning import LinearSkinning
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.rig import Rig
+from fdda_addon.evaluation import heat_map
 from fdda_addon.evaluation.run import evaluate
 from fdda_addon.evaluation.settings import EvaluationSettings
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.run import record
+from fdda_addon.recording.run import MISSING_WEIGHTS, record
 from fdda_addon.rig.deformation import describe_bones, read_unread_bones
-from fdda_addon.rig.reading import read_rig
+from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.runtime.network import Network
 from fdda_addon.runtime.session import session
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.mesh import rest_positions
 from fdda_addon.scene.scene_rig import SceneRig, find_rig, join_rigs
 
-from .conftest import assert_plays, evaluated_positions, run, train
+from .conftest import ELBOW, Trained, assert_plays, build_and_train, evaluated_positions, pose, run, train
 from .rig_changes import change_in_edit_mode, trigger_check
 from .scene_state import drain
-from .waves import wave
+from .stand_ins import import_from
 
 
-@dataclasses.dataclass(frozen=True)
-class LimbFiles:
-    """Paths of the limb with helpers, its recording, and its model with key joints."""
+def build_rigid_elbow() -> None:
+    """Build an elbow with one bone per vertex, smoothed by Corrective Smooth (delta mush)."""
+    mesh_object, _ = build_elbow()
+    lower = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices])) >= 0.5
+    for name, is_member in (("upper", ~lower), ("lower", lower)):
+        mesh_object.vertex_groups[name].remove(range(len(is_member)))
+        mesh_object.vertex_groups[name].add(np.flatnonzero(is_member).tolist(), 1.0, "REPLACE")
 
-    rig: Path
-    recording: Path
-    model: Path
 
-    def open(self) -> SceneRig:
-        bpy.ops.wm.open_mainfile(filepath=str(self.rig))
-        return find_rig("limb")
+def build_cloth() -> SceneRig:
+    """Build a mesh without weights that a Surface Deform modifier attaches to a skinned body."""
+    stacks.surface_deform()
+    rig = find_rig(ELBOW)
+    rig.mesh_object.modifiers.remove(rig.mesh_object.modifiers["Armature"])
+    rig.mesh_object.vertex_groups.clear()
+    return rig
 
 
 @pytest.fixture(scope="module")
-def limb_files(tmp_path_factory) -> LimbFiles:
-    folder = tmp_path_factory.mktemp("limb")
-    files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    limb_with_helpers()
-    save_copy(files[0])
-    assert run("record", *files[:2], "--poses", 300) == 0
-    train(*files[1:], "--passes", 60, "--bones-to-read", "auto")
-    return LimbFiles(*files)
+def make_fitted_character(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Trained]:
+    """Return a function that records a character and trains a model with fitted weights, once for each kind."""
+
+    @cache
+    def make(kind: str, build: Callable[[], object]) -> Trained:
+        options, training = ("--object", ELBOW, "--poses", 120), ("--passes", 25, "--base-skinning", kind)
+        return build_and_train(tmp_path_factory.mktemp("fitted"), build, *options, training=training)
+
+    return make
 
 
-def build_limb(build=limb_with_helpers) -> SceneRig:
+KINDS_AND_BUILDERS = [("hard", build_cloth), ("smooth", build_rigid_elbow)]
+
+
+def pose_matrices(rig: SceneRig, recorded: Rig) -> np.ndarray:
+    """Return the evaluated pose matrices (J, 4, 4) of the joints of a recording."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    reader = PoseReader(rig, recorded.joint_names, recorded.rest_matrices)
+    return reader.read(*(o.evaluated_get(depsgraph) for o in (rig.mesh_object, rig.armature_object)))
+
+
+@pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
+def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fitted_character):
+    files = make_fitted_character(kind, build)
+    recording, info = read_recording(files.recording), read_model_info(files.model)
+    fit = SkinFit.from_json(info.training["fit"])
+    assert fit.sentence() == info.skin_sentence and (fit.kind, fit.poses) == (kind, 120)
+    for gain in (fit.held_out, fit.training):
+        assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+
+    rig = files.open(ELBOW)
+    rig_data = read_rig(rig)
+    # The fingerprint describes the rig, and does not include fitted weights.
+    assert recording.rig.meshes[0].fingerprint == rig_data.meshes[0].fingerprint == info.meshes[0].fingerprint
+    assert [rig_data.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
+    linear_rig = Network(files.model).linear_rig(rig_data)
+    assert (linear_rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
+    assert (rig_data.skin_weights > 0).sum(axis=1).max() == 1
+
+    evaluation = drain(evaluate(rig, files.model, EvaluationSettings(30)))
+    assert evaluation.fdda.rms < 0.5 * evaluation.linear.rms
+    # The evaluation uses other poses than the fit.
+    assert evaluation.linear.rms == pytest.approx(fit.held_out.rms_mm["fitted"], rel=0.3)
+    assert [p.joint for p in evaluation.partitions] == [p.joint for p in info.partitions]
+    assert [len(p.vertices) for p in evaluation.partitions] == [p.vertices for p in info.partitions]
+
+
+@pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
+def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character):
+    files = make_fitted_character(kind, build)
+    rig = files.open(ELBOW)
+    pose(angle=1.2)
+    rig_shape = evaluated_positions(rig.mesh_object)
+    bind(rig, files.model)
+    model_positions = assert_plays(rig.mesh_object, files.model)
+    heat_map.paint_partitions(rig)
+    assert len(np.unique(heat_map.colors_of(rig.mesh_object), axis=0)) == 2
+    rig.mesh_object.fdda.mode = "LINEAR"
+    linear_positions = evaluated_positions(rig.mesh_object)
+    linear_rig = Network(files.model).linear_rig(read_recording(files.recording).rig)
+    matrices = pose_matrices(rig, linear_rig)
+    np.testing.assert_allclose(linear_positions, LinearSkinning(linear_rig).positions(matrices[None])[0], atol=1e-5)
+    errors = [np.linalg.norm(positions - rig_shape, axis=1).mean() for positions in (model_positions, linear_positions)]
+    assert errors[0] < errors[1] < 0.01
+
+
+def test_a_mesh_without_weights_is_recorded_and_needs_fitted_ones(refusal, tmp_path, capfd):
+    rig = build_cloth()
+    save_copy(tmp_path / "cloth.blend")
+    rig.mesh_object.modifiers.new("Armature", "ARMATURE").object = rig.armature_object
+    save_copy(tmp_path / "without_weights.blend")
+    for name in ("cloth", "without_weights"):
+        assert run("record", tmp_path / f"{name}.blend", tmp_path / name, "--object", ELBOW, "--poses", 12) == 0
+        assert MISSING_WEIGHTS.format(ELBOW) in capfd.readouterr().out
+        text = refusal("train", tmp_path / name, tmp_path / "m.onnx")
+        assert text.startswith("The vertices of 'elbow' follow no bone by skin weights") and "--base-skinning" in text
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "cloth.blend"))
+    settings = bpy.data.objects[ELBOW].fdda.settings
+    settings.recording = str(tmp_path / "other")
+    with pytest.raises(RuntimeError, match="have no weights on deforming bones of 'elbow_rig', so there is no linear"):
+        bpy.ops.fdda.build_model(object=ELBOW)
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_times_of_a_mesh_without_armature_modifier_lack_linear_skinning(make_fitted_character, capfd, tmp_path):
+    files = make_fitted_character(*KINDS_AND_BUILDERS[0])
+    times = tmp_path / "times.json"
+    assert run("benchmark", files.rig, files.model, "--object", ELBOW, "--json", times, "--frames", 2) == 0
+    assert "linear" not in json.loads(times.read_text())
+    printed = capfd.readouterr().out
+    assert "Armature modifier alone" not in printed and "FDDA" in printed
+
+
+def test_a_python_without_scipy_is_named(refusal, elbow_files, tmp_path, monkeypatch):
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "sitecustomize.py").write_text("import sys\nsys.modules['scipy'] = None\n")
+    import_from(packages, monkeypatch)
+    text = refusal("train", elbow_files.recording, tmp_path / "m.onnx", "--base-skinning", "smooth")
+    assert "'scipy'" in text
+
+
+MAIN_BONES = ("bone.0", "bone.1", "bone.2")
+
+HELPERS = ("half.1", "half.2", "push.1", "push.2")
+"""Bones of `limb_with_helpers` that follow the main bones by a constraint or a driver."""
+
+
+def limb_with_helpers() -> tuple[bpy.types.Object, bpy.types.Object]:
+    """Build a limb with delta mush of three main bones; each joint has a half-rotating bone and a driven bone."""
+    mesh_object, armature_object = limb(len(MAIN_BONES), 15.0, twist=20.0)
+    ends = np.linspace(START, END, len(MAIN_BONES) + 1).tolist()
+    for number in (1, 2):
+        x_position, parent = ends[number], f"bone.{number - 1}"
+        add_bones(
+            armature_object,
+            NewBone(f"half.{number}", (x_position, 0.0, 0.0), (x_position + 0.04, 0.0, 0.0), parent),
+            NewBone(f"push.{number}", (x_position - 0.04, 0.0, 0.0), (x_position, 0.0, 0.0), parent),
+        )
+        copy = armature_object.pose.bones[f"half.{number}"].constraints.new("COPY_ROTATION")
+        copy.target, copy.subtarget, copy.influence = armature_object, f"bone.{number}", 0.5
+        copy.target_space = copy.owner_space = "LOCAL"
+        bend = f'pose.bones["bone.{number}"].rotation_euler[0]'
+        drive(armature_object, f'pose.bones["push.{number}"].location', armature_object, bend, "0.03 * value", index=2)
+    add_smooth_weights(mesh_object, armature_object, 4, 0.05)
+    add_delta_mush(mesh_object, 2)
+    return mesh_object, armature_object
+
+
+@pytest.fixture(scope="module")
+def limb_files(tmp_path_factory) -> Trained:
+    training = ("--passes", 60, "--bones-to-read", "auto")
+    return build_and_train(tmp_path_factory.mktemp("limb"), limb_with_helpers, "--poses", 300, training=training)
+
+
+def build_limb() -> SceneRig:
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    return SceneRig(*build())
+    return SceneRig(*limb_with_helpers())
 
 
 def trained(rig: SceneRig, folder: Path) -> ModelInfo:
@@ -151,6 +289,7 @@ def mute_driver(rig: SceneRig) -> None:
 
 
 HALF = "of the bone 'half.1'"
+
 UNREAD_CHANGES = {
     "roll": (lambda r: edit_bone(r, "half.1", roll=1.2), f"'rest pose' {HALF} differs"),
     "tail": (lambda r: edit_bone(r, "push.1", tail=(0.3, 0, 0.3)), "'rest pose' of the bone 'push.1' differs"),
@@ -288,7 +427,9 @@ def test_poses_are_added_at_the_worst_errors(limb_files, tmp_path):
 
 def test_weights_stay_with_their_joints_if_the_order_changes(tmp_path):
     """As in Rigify, the bone "tail" has a parent that copies a joint: without that parent, it comes after the joint."""
-    rig = build_limb(limb_of_free_bones)
+    rig = SceneRig(*limb(6, 30.0))
+    add_smooth_weights(rig.mesh_object, rig.armature_object, 4, 0.05)
+    add_delta_mush(rig.mesh_object, 2)
     copied = rig.armature_object.data.bones["bone.4"]
     ends = tuple(copied.head_local), tuple(copied.tail_local)
     add_bones(rig.armature_object, NewBone("copy", *ends, "bone.0"), NewBone("tail", *ends, "copy"))
