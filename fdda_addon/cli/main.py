@@ -70,8 +70,8 @@ def _run(arguments: list[str], program: str) -> int:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     for name, (_, summary) in VERBS.items():
         verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-    for name in INTERNAL_VERBS:
-        verbs.add_parser(name)
+    if verb in INTERNAL_VERBS:
+        verbs.add_parser(verb)
     if verb not in (None, TRAIN):
         # The modules of other verbs are not imported, so that the verb starts fast.
         import_module(f".{modules[verb]}", __package__).add_options(verbs.choices[verb])

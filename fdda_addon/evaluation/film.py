@@ -144,8 +144,9 @@ class _FilmPicture(Picture):
     """A picture with a row of meshes that move from frame to frame."""
 
     def __init__(self, scene_rig: SceneRig, model: Path | Network, errors: PoseErrors, settings: FilmSettings):
-        super().__init__(settings.view, scene_rig.mesh_object)
+        # First, because it refuses a wrong model.
         self._deformations, self._errors, self._settings = Deformations(scene_rig, model), errors, settings
+        super().__init__(settings.view, scene_rig.mesh_object)
         self._centers, cell_size = _centers_and_size(errors.positions, self.projection)
         shown_errors = errors.linear if LINEAR_ERROR in settings.columns else errors.fdda
         # The error in meters that has the last color of the heat map.

@@ -39,9 +39,12 @@ def iterate_in_thread(job: Job[Result], state: JobState, cancel: Callable[[], No
     thread = threading.Thread(target=work, name=f"FDDA: {state.title}", daemon=True)
     thread.start()
     try:
+        while thread.is_alive() and not (state.cancel_requested and cancel):
+            yield None
+        if thread.is_alive():
+            cancel, cancel_job = None, cancel
+            cancel_job()
         while thread.is_alive():
-            if state.cancel_requested and cancel:
-                cancel()
             yield None
     finally:
         if cancel and thread.is_alive():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators that write a character to files that play without the add-on: baked caches, and fitted skin weights."""
 
+import os
 import re
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from ..scene.blend_file import save_copy
 from .job import FileJobOperator
 from .rig_operator import NEEDS_MODEL
 
+FORMATS = {".blend": ".blend", ".abc": ".abc", ".usd": ".usdc", ".usda": ".usdc", ".usdc": ".usdc"}
+"""Extensions of a bake, each with its value of `FDDA_OT_bake.format`."""
+
 
 class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
     bl_idname = "fdda.bake"
@@ -29,6 +33,8 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
     needs = NEEDS_MODEL
     verb, title = "bake", "Bake"
     changes_scene = False
+    _checked_format = ".blend"
+    """The format when `check` was called last."""
 
     filepath: bpy.props.StringProperty(
         name="File",
@@ -45,33 +51,38 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
             (".abc", "Alembic", "An .abc file alone"),
             (".usdc", "USD", "A .usdc file"),
         ),
-        options={"SKIP_SAVE"},
     )
     action: bpy.props.StringProperty(
         name="Action",
         description="Action to bake. Empty for the animation of the scene",
         options={"SKIP_SAVE"},
     )
-    use_frames: bpy.props.BoolProperty(
-        name="Frame Range", description="Bake these frames instead of all of the action", options={"SKIP_SAVE"}
-    )
-    frame_start: bpy.props.IntProperty(name="Start", description="First frame", default=1, options={"SKIP_SAVE"})
-    frame_end: bpy.props.IntProperty(name="End", description="Last frame", default=250, options={"SKIP_SAVE"})
+    use_frames: bpy.props.BoolProperty(name="Frame Range", description="Bake these frames instead of all of the action")
+    frame_start: bpy.props.IntProperty(name="Start", description="First frame", default=1)
+    frame_end: bpy.props.IntProperty(name="End", description="Last frame", default=250)
     samples: bpy.props.IntProperty(
         name="Samples",
         description="Samples per frame, for motion blur of an Alembic file",
         default=1,
         min=1,
-        options={"SKIP_SAVE"},
     )
 
     def suggested_path(self, context: bpy.types.Context) -> str:
+        self._checked_format = self.format
         name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
         return f"//{Path(bpy.data.filepath).stem or 'character'}_{name}_baked{self.format}"
 
     def check(self, _context: bpy.types.Context) -> bool:
-        """Give the file in the browser the extension of the format; return whether it has changed."""
-        path, self.filepath = self.filepath, str(Path(self.filepath).with_suffix(self.format))
+        """Give the file in the browser the extension of a new format, and take the format of a typed extension."""
+        path, (stem, suffix) = self.filepath, os.path.splitext(self.filepath)
+        typed_format = FORMATS.get(suffix.lower())
+        if self.format == self._checked_format and typed_format:
+            self.format = typed_format
+        elif os.path.basename(path) and typed_format != self.format:
+            self.filepath = (stem if typed_format else path) + self.format
+        self._checked_format = self.format
+        if self.format == ".usdc":
+            self.samples = 1
         return self.filepath != path
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -84,7 +95,7 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
         row.prop(self, "frame_start")
         row.prop(self, "frame_end")
         samples = column.row()
-        samples.active = self.format != ".usdc"
+        samples.enabled = self.format != ".usdc"
         samples.prop(self, "samples")
 
     def steps(self, context: bpy.types.Context) -> Job[str]:

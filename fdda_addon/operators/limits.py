@@ -55,6 +55,12 @@ class _AxesOperator(_SelectedBonesOperator):
     axes: bpy.props.BoolVectorProperty(
         name="Axes", description="Axes of the rotation, in local space", default=(True,) * 3, options={"SKIP_SAVE"}
     )
+    bone_description = ""
+    """Description of a button for one bone."""
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return cls.bone_description if properties.bone else cls.bl_description
 
     def bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
         """Return the bones to apply the operator to.
@@ -69,6 +75,12 @@ class _AxesOperator(_SelectedBonesOperator):
         if bone is None:
             raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'; give the name of one.")
         return [bone]
+
+    def format_bones(self, bones: list[bpy.types.PoseBone]) -> str:
+        """Return what the message calls the bones that `bones` has returned."""
+        if not self.bone:
+            return format_count(len(bones), "bone")
+        return f"'{self.bone}' about {', '.join(AXES[axis] for axis in range(3) if self.axes[axis])}"
 
 
 def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_mirrored: bool = False) -> None:
@@ -85,8 +97,9 @@ def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_
 
 class FDDA_OT_set_limits(_AxesOperator, bpy.types.Operator):
     bl_idname = "fdda.set_limits"
-    bl_label = "Set Limits of Selected Bones"
+    bl_label = "Set Limits"
     bl_description = "Give all selected bones the same rotation limits"
+    bone_description = "Give the bone rotation limits about this axis. The default is ±45°"
 
     low: bpy.props.FloatVectorProperty(
         name="Minimum", subtype="EULER", default=(-math.pi / 4,) * 3, min=-math.pi, max=math.pi
@@ -126,7 +139,7 @@ class FDDA_OT_set_limits(_AxesOperator, bpy.types.Operator):
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 set_rotation_range(bone, axis, self.low[axis], self.high[axis])
-        return f"Set the limits of {format_count(len(bones), 'bone')}."
+        return f"Set the limits of {self.format_bones(bones)}."
 
 
 class FDDA_OT_copy_limits(_SelectedBonesOperator, bpy.types.Operator):
@@ -209,15 +222,16 @@ class FDDA_OT_human_limits(_LimitsOperator, bpy.types.Operator):
 
 class FDDA_OT_clear_limits(_AxesOperator, bpy.types.Operator):
     bl_idname = "fdda.clear_limits"
-    bl_label = "Clear Limits of Selected Bones"
+    bl_label = "Clear Limits"
     bl_description = "Remove the rotation limits of the selected bones. The default is ±45°"
+    bone_description = "Remove the rotation limits of the bone about this axis. The default is ±45°"
 
     def apply(self, context: bpy.types.Context) -> str:
         bones = self.bones(context)
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 clear_rotation_range(bone, axis)
-        return f"Removed the limits of {format_count(len(bones), 'bone')}."
+        return f"Removed the limits of {self.format_bones(bones)}."
 
 
 CLASSES = (

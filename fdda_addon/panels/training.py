@@ -181,7 +181,8 @@ def _draw_settings(
     elif not is_recorded:
         draw_wrapped(layout, context, "This rig has no complete recording yet; record first.", "INFO")
     if trained is not None and trained.mismatch:
-        text = f"{trained.path.name} belongs to another rig: {trained.mismatch}. Train keeps it as the previous model."
+        mismatch = trained.mismatch.rstrip(".")
+        text = f"{trained.path.name} does not fit this rig: {mismatch}. Train keeps it as the previous model."
         draw_wrapped(layout, context, text, "ERROR")
     elif trained is not None:
         draw_wrapped(layout, context, f"{trained.path.name} exists; Train Again keeps it as the previous model.")

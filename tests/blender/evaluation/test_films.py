@@ -9,7 +9,7 @@ import pytest
 from mathutils import Matrix
 
 from blend_fixtures.elbow import ACTION
-from fdda_addon.core.errors import OutputError
+from fdda_addon.core.errors import ModelError, OutputError
 from fdda_addon.core.progress import Progress, run_job
 from fdda_addon.evaluation import video
 from fdda_addon.evaluation.film import (
@@ -114,8 +114,11 @@ def test_a_film_is_written_in_both_formats(errors: PoseErrors, rig: SceneRig, el
     assert datablocks() == before and {path.name for path in tmp_path.iterdir() if path.suffix != ".png"} == {out.name}
 
 
-def test_a_closed_film_leaves_nothing(errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path):
+def test_a_closed_or_refused_film_leaves_nothing(errors: PoseErrors, rig: SceneRig, elbow_files, tmp_path: Path):
     out, before = tmp_path / "film.mp4", datablocks()
+    with pytest.raises(ModelError):
+        next(film(rig, tmp_path / "none.onnx", errors, FIRST, out, SMALL))
+    assert datablocks() == before
     steps = film(rig, elbow_files.model, errors, FIRST, out, SMALL)
     assert next(steps) == Progress("film", 1, 4) and any(tmp_path.iterdir())
     steps.close()

@@ -15,6 +15,7 @@ from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import job, verb_process
 from fdda_addon.jobs.job import state_of
 from fdda_addon.jobs.verb_process import VerbProcess
+from fdda_addon.operators.baking import FDDA_OT_bake
 from fdda_addon.operators.fast_rig import FDDA_OT_fast_rig
 from fdda_addon.runtime.model_files import write_models
 from fdda_addon.scene.scene_rig import find_rig
@@ -75,6 +76,23 @@ def test_a_wrong_path_action_or_binding_is_refused(active, tmp_path):
     bpy.ops.fdda.unbind()
     refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.abc")), "No model is bound; bind one first")
     assert file_contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("typed", "old_format", "chosen", "file", "file_format"),
+    [
+        ("a.blend", ".blend", ".abc", "a.abc", ".abc"),
+        ("hero.v2", ".abc", ".usdc", "hero.v2.usdc", ".usdc"),
+        ("a.USDA", ".blend", ".blend", "a.USDA", ".usdc"),
+        ("film/", ".blend", ".abc", "film/", ".abc"),
+        ("/", ".blend", ".abc", "/", ".abc"),
+    ],
+)
+def test_file_and_format_in_the_browser_follow_each_other(typed, old_format, chosen, file, file_format):
+    browser = SimpleNamespace(filepath=typed, format=chosen, _checked_format=old_format, samples=2)
+    assert FDDA_OT_bake.check(browser, None) == (file != typed)
+    assert (browser.filepath, browser.format) == (file, file_format)
+    assert browser.samples == (1 if file_format == ".usdc" else 2), "USD has one sample per frame"
 
 
 def test_no_operator_reuses_the_path_or_object_of_its_last_call():
