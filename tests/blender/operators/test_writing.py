@@ -126,7 +126,7 @@ def test_the_skinning_of_the_recorded_mesh_is_exported(saved, elbow_files, tmp_p
 
 
 @pytest.fixture
-def saved(bound_elbow, tmp_path):
+def packed(bound_elbow, tmp_path):
     """Save the bound elbow, with its model packed, into a folder without the model's file."""
     bpy.context.view_layer.objects.active = bound_elbow
     bpy.ops.fdda.pack_model()
@@ -134,20 +134,20 @@ def saved(bound_elbow, tmp_path):
     return tmp_path
 
 
-def test_a_fast_rig_is_written_and_the_open_file_stays(saved, elbow_files):
+def test_a_fast_rig_is_written_and_the_open_file_stays(packed, elbow_files):
     """A point in the name is kept."""
-    content = (saved / "elbow.blend").read_bytes()
-    assert bpy.ops.fdda.fast_rig(filepath=str(saved / "fast.v2")) == {"FINISHED"}
+    content = (packed / "elbow.blend").read_bytes()
+    assert bpy.ops.fdda.fast_rig(filepath=str(packed / "fast.v2")) == {"FINISHED"}
     assert "fast.v2.blend: 'elbow_rig' has 2 of 2 bones; the model reads 2" in job.state_of("fast_rig").outcome
     assert "times as fast" in job.state_of("fast_rig").outcome
-    assert bpy.data.filepath == str(saved / "elbow.blend") and (saved / "elbow.blend").read_bytes() == content
+    assert bpy.data.filepath == str(packed / "elbow.blend") and (packed / "elbow.blend").read_bytes() == content
     assert not bpy.data.objects[ELBOW].fdda.is_fast_rig
-    bpy.ops.wm.open_mainfile(filepath=str(saved / "fast.v2.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(packed / "fast.v2.blend"))
     mesh_object = bpy.data.objects[ELBOW]
     assert mesh_object.fdda.is_fast_rig and "CorrectiveSmooth" not in mesh_object.modifiers
     pose(angle=0.7)
     assert_plays(mesh_object, elbow_files.model)
-    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(saved / "again.blend")), "'elbow' is a fast rig already")
+    refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(packed / "again.blend")), "'elbow' is a fast rig already")
 
 
 def test_a_fast_rig_is_not_compared_with_what_is_left_of_the_rig(bound_elbow):
@@ -172,7 +172,7 @@ REMAINING = "'elbow' belongs to a fast rig: without a model, only what is left o
 
 
 @pytest.mark.parametrize("is_fast_rig", [False, True])
-def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(saved, is_fast_rig, capfd):
+def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(packed, is_fast_rig, capfd):
     bpy.data.objects[ELBOW].fdda.is_fast_rig = is_fast_rig
     assert bpy.ops.fdda.unbind() == {"FINISHED"}
     assert (REMAINING in capfd.readouterr().out) == is_fast_rig
@@ -182,26 +182,26 @@ def test_a_fast_rig_without_a_model_says_what_deforms_the_mesh(saved, is_fast_ri
     assert capfd.readouterr().out.count(REMAINING) == is_fast_rig
 
 
-def test_the_sentence_of_the_verb_is_the_report(saved):
+def test_the_sentence_of_the_verb_is_the_report(packed):
     """The other Blender refuses an armature that another object uses."""
     other = bpy.data.objects.new("other", bpy.data.objects[ELBOW_RIG].data)
     bpy.context.scene.collection.objects.link(other)
     bpy.ops.wm.save_mainfile()
-    out = saved / "fast.blend"
+    out = packed / "fast.blend"
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=str(out)), "'other' uses the armature of 'elbow_rig' too")
     assert not out.exists()
 
 
-def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(saved, elbow_files):
-    before = sorted(path.name for path in saved.iterdir())
-    arguments = [str(saved / "elbow.blend"), str(elbow_files.model), str(saved / "fast.blend"), "--frames", "100000"]
+def test_a_canceled_job_ends_the_other_blender_and_writes_nothing(packed, elbow_files):
+    before = sorted(path.name for path in packed.iterdir())
+    arguments = [str(packed / "elbow.blend"), str(elbow_files.model), str(packed / "fast.blend"), "--frames", "100000"]
     with VerbProcess("fast-rig", arguments) as process:
         steps = process.steps()
         while not isinstance(next(steps), Progress):
             time.sleep(0.01)
         assert process.is_running
     assert not process.is_running
-    assert sorted(path.name for path in saved.iterdir()) == before
+    assert sorted(path.name for path in packed.iterdir()) == before
 
 
 def test_the_other_blender_registers_an_add_on_that_it_does_not_load(monkeypatch):
@@ -214,8 +214,8 @@ def test_the_other_blender_registers_an_add_on_that_it_does_not_load(monkeypatch
     assert result.stdout.endswith("done\n"), result.stderr
 
 
-def test_unsaved_files_and_missing_choices_are_refused(saved):
-    out = str(saved / "fast.blend")
+def test_unsaved_files_and_missing_choices_are_refused(packed):
+    out = str(packed / "fast.blend")
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, visible=False, keyed=False), "No controls were chosen")
     refused(lambda: bpy.ops.fdda.fast_rig(filepath=out, collection="Faces"), "has no bone collection 'Faces'")
     refused(bpy.ops.fdda.fast_rig, "No file was chosen; give the name of a .blend file.")
@@ -228,7 +228,7 @@ def test_the_report_has_a_sentence_for_each_line_of_the_verb(name):
     assert FDDA_OT_fast_rig.finish(None, None, output) == expected
 
 
-def test_meshes_of_one_model_share_its_file(saved, tmp_path_factory):
+def test_meshes_of_one_model_share_its_file(packed, tmp_path_factory):
     mesh_object = bpy.data.objects[ELBOW]
     other = mesh_object.copy()
     bpy.context.scene.collection.objects.link(other)
