@@ -32,7 +32,7 @@ from ..conftest import (
     run,
     write_edited,
 )
-from ..rendering import set_camera, still
+from ..playback import set_camera, still
 
 CHARACTER = "Character"
 

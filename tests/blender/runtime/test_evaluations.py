@@ -11,8 +11,7 @@ from fdda_addon.runtime.depsgraph_changes import seen_mode
 from fdda_addon.runtime.session import session
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
-from ..playback import add_shape_key, handler, shown_in
-from ..rendering import rig_pixels, set_camera, still
+from ..playback import add_shape_key, handler, rig_pixels, set_camera, shown_in, still
 
 FRAMES = (4, 11, 20)
 

@@ -34,8 +34,7 @@ from ..linked import (
     save_new_shot,
     shot_path,
 )
-from ..playback import animate, count_calls
-from ..rendering import render_positions, rig_pixels, set_camera, still
+from ..playback import animate, count_calls, render_positions, rig_pixels, set_camera, still
 
 CROWD_SIZE = 20
 

@@ -17,8 +17,7 @@ from fdda_addon.runtime.transitions import State
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions
-from ..playback import handler, shown_in
-from ..rendering import FRAME, animation, rig_pixels, set_camera, still
+from ..playback import FRAME, animation, handler, rig_pixels, set_camera, shown_in, still
 from ..rig_changes import change_in_edit_mode
 
 

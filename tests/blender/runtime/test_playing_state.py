@@ -35,8 +35,7 @@ from ..conftest import (
     rig_positions,
     write_edited,
 )
-from ..playback import crowd_of, handler
-from ..rendering import FRAME, animation, set_camera
+from ..playback import FRAME, animation, crowd_of, handler, set_camera
 from ..rig_changes import change_in_edit_mode
 
 RENDER_HANDLERS = ("render_pre", "render_post", "render_write")

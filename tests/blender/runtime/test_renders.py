@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, predicted_positions
-from ..playback import add_shape_key, handler
-from ..rendering import FRAME, animation, render_positions, rig_pixels, set_camera, still
+from ..playback import FRAME, add_shape_key, animation, handler, render_positions, rig_pixels, set_camera, still
 
 
 @pytest.fixture

@@ -34,8 +34,7 @@ from ..conftest import (
     run,
     train,
 )
-from ..playback import count_calls
-from ..rendering import set_camera, still
+from ..playback import count_calls, set_camera, still
 
 SLEEVE, CUFF = "sleeve", "cuff"
 NAMES = (ELBOW, SLEEVE, CUFF)
