@@ -70,9 +70,11 @@ def lower_weights(points: np.ndarray) -> np.ndarray:
     return t * t * (3.0 - 2.0 * t)
 
 
-def skin(mesh_object: "bpy.types.Object", armature_object: "bpy.types.Object") -> None:
-    """Add the weights of the tube and an Armature modifier to a mesh object."""
-    weights = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices]))
+def skin(
+    mesh_object: "bpy.types.Object", armature_object: "bpy.types.Object", points: np.ndarray | None = None
+) -> None:
+    """Add the weights of the tube and an Armature modifier to a mesh object; `points` are its vertices, unrounded."""
+    weights = lower_weights(np.array([v.co for v in mesh_object.data.vertices]) if points is None else points)
     for name, values in (("upper", 1.0 - weights), ("lower", weights)):
         group = mesh_object.vertex_groups.new(name=name)
         for index in np.flatnonzero(values > 0.0):
@@ -103,7 +105,7 @@ def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
     elbow = bpy.data.objects.new(ELBOW_OBJECT, mesh)
     bpy.context.scene.collection.objects.link(elbow)
     elbow.parent = rig
-    skin(elbow, rig)
+    skin(elbow, rig, points)
     smooth = elbow.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.6, 8
     _add_wave(rig)
