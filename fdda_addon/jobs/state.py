@@ -48,7 +48,6 @@ class JobState:
         changes_scene: whether the job changes the scene and restores it.
         is_running: whether it is running.
         cancel_requested: whether the user has requested cancellation.
-        current_object: name of the object that the job works on now; empty for a job on one object.
         steps: the steps of a job; empty for a job with one.
         step: index of the running step.
         stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
@@ -68,7 +67,6 @@ class JobState:
     can_cancel: bool = True
     is_running: bool = True
     cancel_requested: bool = False
-    current_object: str = ""
     steps: Sequence[JobStep] = ()
     step: int = 0
     stage: str = ""
@@ -102,9 +100,8 @@ class JobState:
 
     @property
     def heading(self) -> str:
-        """Return a short text for the progress bar: "Step 2 of 5, body", "body" or "Recording"."""
-        parts = [f"Step {self.step + 1} of {len(self.steps)}" if len(self.steps) > 1 else "", self.current_object]
-        return ", ".join(filter(None, parts)) or self.title
+        """Return a short text for the progress bar: "Step 2 of 5" or "Recording"."""
+        return f"Step {self.step + 1} of {len(self.steps)}" if len(self.steps) > 1 else self.title
 
     @property
     def detail(self) -> str:
@@ -119,7 +116,7 @@ class JobState:
 
     @property
     def sentence(self) -> str:
-        """Return heading and detail in one line: "Step 2 of 5, body: training: 50 of 200"."""
+        """Return heading and detail in one line: "Step 2 of 5: training: 50 of 200"."""
         heading = "" if self.heading == self.title else f"{self.heading}: "
         return heading + (self.detail[:1].lower() + self.detail[1:] if heading else self.detail)
 
@@ -144,14 +141,9 @@ class JobState:
         is_complete = self.is_in_last_step and 0 < self.total == self.done
         return is_complete and self.stage.partition(" of '")[0] not in PREPARING_STAGES
 
-    def begin_object(self, name: str) -> None:
-        """Reset the progress and the curves, because the job begins with another object."""
-        self.current_object, self.stage, self.done, self.total = name, "", 0, 0
-        self.curves.clear()
-
     def show(self, progress: Progress) -> None:
         """Update the progress."""
-        if progress.stage != self.stage:
+        if progress.stage != self.stage or progress.done < self.done:
             self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
             name = progress.stage.partition(" of '")[0]
             later_steps = range(self.step, len(self.steps))

@@ -9,10 +9,10 @@ from ..core.recording.folder import is_recorded
 from ..core.recording.index import INDEX_NAME
 from ..properties.character import model_file, recording_folder
 from ..recording.rig_check import check_has_weights
-from ..scene.scene_rig import SceneRig, armature_of, describe_left_out
+from ..scene.scene_rig import SceneRig, armature_of
 from .playback import bind_model
 from .recording import record_character, recordable_character, recording_steps
-from .training import TrainingOperator, is_mesh_recorded
+from .training import TrainingOperator, recorded_meshes
 
 
 class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
@@ -37,10 +37,9 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
         recording, model = recording_folder(mesh_object), model_file(mesh_object)
         is_missing = not is_recorded(recording)
         if not is_missing:
-            unrecorded = [o for o in mesh_objects[1:] if not is_mesh_recorded(o, recording)]
-            mesh_objects = [o for o in mesh_objects if o not in unrecorded]
-            self._note = f"{self._note} {describe_left_out(dict.fromkeys(unrecorded, 'not in this recording'))}".strip()
-        self.state.steps = [*(recording_steps(shown) if is_missing else ()), *self.training_steps(mesh_objects[0])]
+            mesh_objects, unrecorded = recorded_meshes(mesh_objects, recording)
+            self._note = f"{self._note} {unrecorded}".strip()
+        self.state.steps = [*(recording_steps(shown) if is_missing else ()), *self.training_steps(mesh_object)]
         if is_missing:
             # An interrupted recording is resumed.
             for step in record_character(character, mesh_object, recording, (recording / INDEX_NAME).exists()):
@@ -48,22 +47,22 @@ class FDDA_OT_build_model(TrainingOperator, bpy.types.Operator):
                 if self.state.cancel_requested:
                     return None
         self.changes_scene = self.state.changes_scene = False
-        return (yield from self.train_all([(mesh_objects, recording, model)]))
+        return (yield from self.train(mesh_objects, recording, model))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
-        self.add_trained_models_to_list()
+        mesh_objects, model = self.add_trained_model_to_list()
         sentences = []
         bound_objects: list[bpy.types.Object] = []
-        for mesh_object, model in self.meshes_of_trained_models():
+        for mesh_object in mesh_objects:
             armature_object = armature_of(mesh_object)
             if armature_object is not None and mesh_object not in bound_objects:
-                sentence, mesh_objects = bind_model(SceneRig(mesh_object, armature_object), model)
+                sentence, newly_bound = bind_model(SceneRig(mesh_object, armature_object), model)
                 sentences.append(sentence)
-                bound_objects += mesh_objects
+                bound_objects += newly_bound
         return " ".join(filter(None, [f"Trained in {result:.0f} s.", *sentences, self._note]))
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
-        self.add_trained_models_to_list()
+        self.add_trained_model_to_list()
         return "Canceled. What was recorded is kept, and the next run continues from there."
 
 

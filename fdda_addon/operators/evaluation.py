@@ -69,7 +69,6 @@ class FDDA_OT_evaluate(JobOperator, bpy.types.Operator):
         evaluations: list[tuple[int, Evaluation]] = []
         with model_disabled(*(rig.mesh_object for rig in rigs)):
             for (network, _), group in passes.items():
-                self.state.begin_object(group[0].mesh_object.name if len(passes) > 1 else "")
                 target = target_settings(group[0].mesh_object.fdda.settings)
                 if self._action:
                     target = replace(target, settle_frames=0)

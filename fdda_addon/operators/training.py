@@ -43,6 +43,9 @@ class TrainingOperator(JobOperator):
     The training continues after Blender quits (`training.detached_process`).
     """
 
+    _trained: tuple[list[int], Path | None] = ([], None)
+    """session_uid of the meshes, and the model file, once the training is finished."""
+
     def train(
         self, mesh_objects: Sequence[bpy.types.Object], recording: Path, model: Path, warm_start: bool = False
     ) -> Job[float | None]:
@@ -66,7 +69,7 @@ class TrainingOperator(JobOperator):
                     if message is not None:
                         if message.type is MessageType.FINISHED:
                             # This message may come after a cancellation, if the trainer was writing the model.
-                            self.trained_models.extend((uid, model) for uid in mesh_uids)
+                            self._trained = mesh_uids, model
                             seconds = float(message.values["seconds"])
                         yield self._to_progress(message)
                         continue
@@ -79,18 +82,6 @@ class TrainingOperator(JobOperator):
                     # Another file is opened, or Blender quits.
                     training.detach()
                 raise
-        return seconds
-
-    def train_all(
-        self, files: list[tuple[Sequence[bpy.types.Object], Path, Path]], warm_start: bool = False
-    ) -> Job[float | None]:
-        """Train models, each given with its meshes and its recording; return the seconds of the last training."""
-        seconds = None
-        for mesh_objects, recording, model in files:
-            self.state.begin_object(mesh_objects[0].name if len(files) > 1 else "")
-            seconds = (yield from self.train(mesh_objects, recording, model, warm_start)) or seconds
-            if self.state.cancel_requested:
-                break
         return seconds
 
     def training_steps(self, mesh_object: bpy.types.Object) -> list[JobStep]:
@@ -149,30 +140,21 @@ class TrainingOperator(JobOperator):
             state.warnings.append(WARNING_LINE.format(**values))
         return None
 
-    def add_trained_models_to_list(self) -> None:
-        """Add the trained models to the Model Library of their meshes."""
-        self.changes_file = bool(self.trained_models)
-        for mesh_object, model in self.meshes_of_trained_models():
+    def add_trained_model_to_list(self) -> tuple[list[bpy.types.Object], Path | None]:
+        """Add the trained model to the Model Library of its meshes; return those that still exist, and the model."""
+        uids, model = self._trained
+        self.changes_file = bool(uids)
+        mesh_objects = [o for o in bpy.data.objects if o.session_uid in uids]
+        for mesh_object in mesh_objects:
             add_former_model(mesh_object, model)
             # The last one that is added is the active one.
             add_model(mesh_object, model)
-
-    def meshes_of_trained_models(self) -> list[tuple[bpy.types.Object, Path]]:
-        """Return the meshes that still exist, each with its trained model."""
-        objects = {o.session_uid: o for o in bpy.data.objects}
-        return [(objects[uid], model) for uid, model in self.trained_models if uid in objects]
+        return mesh_objects, model
 
     def on_failure(self) -> None:
-        # Models that were trained before the failure have new files, so packed copies of them are outdated.
+        # A training that ended before the failure has written a new file, so packed copies of it are outdated.
         with suppress(FDDAError):
-            self.add_trained_models_to_list()
-
-    @property
-    def trained_models(self) -> list[tuple[int, Path]]:
-        """Return session_uid of the mesh and path of the model for each finished training."""
-        if not hasattr(self, "_trained_models"):
-            self._trained_models: list[tuple[int, Path]] = []
-        return self._trained_models
+            self.add_trained_model_to_list()
 
 
 class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
@@ -211,34 +193,31 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
             )
         return cls.bl_description
 
-    def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
-        """Return the folder of the recording and the file of the model of a mesh."""
-        recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
-        return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
-
     def steps(self, context: bpy.types.Context) -> Job[float | None]:
-        # Meshes of one recording have one model.
-        meshes_of_files: dict[tuple[Path, Path], list[bpy.types.Object]] = {}
-        shown_object, unrecorded = self.rig(context).mesh_object, {}
-        for mesh_object in sorted((rig.mesh_object for rig in self.rigs(context)), key=lambda o: o != shown_object):
-            files = self._files(mesh_object)
-            if mesh_object == shown_object or is_mesh_recorded(mesh_object, files[0]) or is_detached(files[1]):
-                meshes_of_files.setdefault(files, []).append(mesh_object)
-            else:
-                unrecorded[mesh_object] = "not recorded"
-        self._note = describe_left_out(unrecorded)
-        files = [(mesh_objects, *paths) for paths, mesh_objects in meshes_of_files.items()]
-        self.state.steps = [step for mesh_objects, *_ in files for step in self.training_steps(mesh_objects[0])]
-        return (yield from self.train_all(files, self.warm_start))
+        mesh_object = self.rig(context).mesh_object
+        recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
+        model = Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
+        mesh_objects = [mesh_object, *(rig.mesh_object for rig in self.rigs(context) if rig.mesh_object != mesh_object)]
+        self._note = ""
+        if not is_detached(model):
+            mesh_objects, self._note = recorded_meshes(mesh_objects, recording)
+        self.state.steps = self.training_steps(mesh_object)
+        return (yield from self.train(mesh_objects, recording, model, self.warm_start))
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
-        self.add_trained_models_to_list()
-        names = " and ".join(dict.fromkeys(f"'{model.name}'" for _, model in self.trained_models))
-        return f"Trained {names} in {result:.0f} s. {self._note}".rstrip()
+        _, model = self.add_trained_model_to_list()
+        return f"Trained '{model.name}' in {result:.0f} s. {self._note}".rstrip()
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
-        self.add_trained_models_to_list()
+        self.add_trained_model_to_list()
         return "Training canceled; no model was written."
+
+
+def recorded_meshes(mesh_objects: list[bpy.types.Object], recording: Path) -> tuple[list[bpy.types.Object], str]:
+    """Return the first of some meshes and those others that a recording has, and a sentence about the rest."""
+    left_out = [o for o in mesh_objects[1:] if not is_mesh_recorded(o, recording)]
+    sentence = describe_left_out(dict.fromkeys(left_out, "not in this recording"))
+    return [o for o in mesh_objects if o not in left_out], sentence
 
 
 def is_mesh_recorded(mesh_object: bpy.types.Object, recording: Path) -> bool:

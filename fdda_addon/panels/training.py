@@ -123,12 +123,7 @@ def _last_training(rig: SceneRig) -> JobState | None:
     states = [
         state
         for state in states
-        if state is not None
-        and not state.is_running
-        and (
-            state.current_object == mesh_object.name
-            or (not state.current_object and state.subject == mesh_object.session_uid)
-        )
+        if state is not None and not state.is_running and state.subject == mesh_object.session_uid
     ]
     return max(states, key=lambda state: state.ended, default=None)
 

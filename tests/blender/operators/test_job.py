@@ -218,8 +218,7 @@ def test_a_job_with_steps_counts_them_and_knows_the_remaining_time_of_the_runnin
     state.show(Progress("epochs", 0, 200))
     now[0] += 10
     state.show(Progress("epochs", 50, 200))
-    state.current_object = "body"
-    assert state.sentence == "Step 3 of 3, body: training: 50 of 200" and state.remaining_text == "About 30 s left"
+    assert state.sentence == "Step 3 of 3: training: 50 of 200" and state.remaining_text == "About 30 s left"
     state.show(Progress("epochs", 200, 200))
     assert state.is_finishing and state.remaining_text == "Finishing…"
 
