@@ -7,6 +7,7 @@ from typing import Any
 from ..core.errors import WrongUsageError
 from ..core.settings import (
     LEARN_FROM,
+    MIRROR,
     OVERSHOOT,
     POSES,
     PRE_ROLL,
@@ -30,7 +31,7 @@ DEFORMING = "deforming"
 def add_pose_options(parser: argparse.ArgumentParser, **arguments: Any) -> None:
     """Add the options to a parser; `arguments` are those of the option `--poses` that differ (`Setting.add_option`)."""
     POSES.add_option(parser, **arguments)
-    for setting in (SEED, SPREAD, OVERSHOOT):
+    for setting in (SEED, SPREAD, OVERSHOOT, MIRROR):
         setting.add_option(parser)
     add_repeatable_option(parser, "--action", "NAME", "also record all frames of this action")
     add_repeatable_option(parser, "--strip", "NAME", "also record all frames of this NLA strip")

@@ -99,13 +99,14 @@ def check_options(options: argparse.Namespace) -> None:
     new_recording_options = (
         options.action,
         options.strip,
+        options.mirror,
         options.bones_to_pose,
         options.extra_input,
         options.learn_from,
     )
     if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
-            "--refine adds random poses to a complete recording; leave --action, --strip, --bones-to-pose, "
+            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --bones-to-pose, "
             "--extra-input and --learn-from out."
         )
     if options.all and options.object:

@@ -141,6 +141,12 @@ OVERSHOOT = Setting(
     ui={"step": 10},
 )
 """Factor by which the range of motion is scaled for overshoot poses (`poses.Overshoot`); 1 for no overshoot."""
+MIRROR = Setting(
+    "mirror",
+    False,
+    "Record each frame of the actions a second time with left and right swapped. The armature must be symmetric",
+    "Also Record Mirrored",
+)
 LEARN_FROM = Setting(
     "learn_from",
     "",

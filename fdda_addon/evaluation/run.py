@@ -118,7 +118,7 @@ def evaluate_meshes(
             scaled_range_errors.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         for clip in clips:
             poses = pose_setter.show_frames(player, clip, range(len(clip.frames)))
-            action_errors.append((yield from comparison.compare(clip.name, poses)))
+            action_errors.append((yield from comparison.compare(clip.title, poses)))
     return [
         Evaluation(
             part_skinning.partitions,

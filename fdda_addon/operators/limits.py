@@ -7,9 +7,9 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.wording import format_count
+from ..poses.clip_player import flipped_name
 from ..poses.human_ranges import human_ranges
 from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
-from ..poses.remix import flipped_name
 from ..scene import draw_cache
 from ..scene.compatibility import is_selected
 from .rig_operator import OBJECT_OR_POSE_MODE, RigOperator

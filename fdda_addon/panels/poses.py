@@ -102,6 +102,10 @@ def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
         return
     box.label(text="Also Record Actions")
     box.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(actions)))
+    row = box.row()
+    # Only the frames of checked actions are mirrored.
+    row.active = any(action.fdda.record for action in actions)
+    row.prop(settings, "mirror")
 
 
 def _has_poses(rig: SceneRig) -> bool:

@@ -188,6 +188,8 @@ def _describe_poses(rig: SceneRig) -> str:
         parts = [f"{POSES.default:,} to {MAX_AUTO_POSES:,} random poses"]
     if frames:
         parts.append(f"{format_count(sum(frames), 'frame')} of {format_count(len(frames), 'action')}")
+        if settings.mirror:
+            parts.append("their mirrored copies")
     return " and ".join(parts)
 
 

@@ -3,12 +3,12 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 
 from ..core.errors import RigError
-from ..core.recording.index import ACTION, STRIP, Source
+from ..core.recording.index import ACTION, MIRRORED, STRIP, Source
 from ..scene.action_slots import dependencies, slots_of_action, unmuted_curves
 from ..scene.compatibility import animation_curves
 from ..scene.scene_rig import SceneRig
@@ -23,24 +23,35 @@ class Clip:
         kind: `ACTION` or `STRIP`.
         name: name of the action or strip.
         frames: the whole frames of the clip, in scene time.
+        is_mirrored: the poses of the clip are mirrored left to right.
     """
 
     kind: str
     name: str
     frames: range
+    is_mirrored: bool = False
+
+    @property
+    def title(self) -> str:
+        """Return the title for users."""
+        return f"{self.name}, mirrored" if self.is_mirrored else self.name
 
     @property
     def source(self) -> Source:
         """Return the description of the clip in a recording."""
-        return Source(self.kind, len(self.frames), self.name, (self.frames.start, 1))
+        kind = MIRRORED if self.is_mirrored else self.kind
+        return Source(kind, len(self.frames), self.name, (self.frames.start, 1))
 
 
-def find_clips(scene_rigs: Sequence[SceneRig], actions: Iterable[str], strips: Iterable[str] = ()) -> tuple[Clip, ...]:
+def find_clips(
+    scene_rigs: Sequence[SceneRig], actions: Iterable[str], strips: Iterable[str] = (), mirror: bool = False
+) -> tuple[Clip, ...]:
     """Find clips by the names of actions and strips, actions first.
 
     Args:
         scene_rigs: the rigs that the clips animate.
         actions, strips: names.
+        mirror: add each clip a second time, mirrored, right after the first.
 
     Raises:
         RigError: there is no action or strip of a name, it animates nothing of the rigs, or a strip is muted.
@@ -64,6 +75,8 @@ def find_clips(scene_rigs: Sequence[SceneRig], actions: Iterable[str], strips: I
             )
         clips.append(Clip(ACTION, name, action_frames(action)))
     clips += [Clip(STRIP, name, _strip_frames(find_strip(datablocks, name))) for name in strips]
+    if mirror:
+        clips = [version for clip in clips for version in (clip, replace(clip, is_mirrored=True))]
     return tuple(clips)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Shows the frames of clips: assigns an action to the datablocks that it animates, or enables their NLA."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -8,12 +9,13 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
+from ..core.errors import RigError
 from ..core.recording.index import ACTION
 from ..scene.action_slots import dependencies, slots_of_action
 from ..scene.animated_values import animated_values, driving_actions, read_value, set_value
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.controls import can_be_set, owner_of, set_control
+from ..scene.controls import can_be_set, is_number, owner_of, set_control
 from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import (
     AnimationState,
@@ -22,6 +24,7 @@ from ..scene.temporary_state import (
     restore_animation,
     temporary_pose,
 )
+from ..scene.unit import metres_per_unit
 from .clip import Clip
 
 PropertyValues = dict[tuple[bpy.types.ID, str], object]
@@ -29,6 +32,107 @@ PropertyValues = dict[tuple[bpy.types.ID, str], object]
 
 ControlledRigs = Sequence[tuple[SceneRig, Iterable[str]]]
 """Rigs of one armature, each with the names of controls that the caller sets between frames."""
+
+
+MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE = 1e-3, 1e-3
+"""Largest distance between an end of a bone and its mirror image: the larger of a distance in meters and a ratio of the
+armature's size."""
+AXIS_TOLERANCE = 1e-2
+"""Largest angle between an axis of a bone and the same axis of its mirror image, radians."""
+
+_MIRROR_SIGNS = {
+    "location": (-1, 1, 1),
+    "rotation_euler": (1, -1, -1),
+    "rotation_quaternion": (1, 1, -1, -1),
+    "rotation_axis_angle": (1, 1, -1, -1),
+    "scale": (1, 1, 1),
+}
+_QUOTED_NAME = re.compile(r'\["((?:[^"\\]|\\.)*)"\]')
+
+
+def flipped_name(name: str) -> str:
+    """Return the name for the other side, such as `arm.R` for `arm.L`; a name without a side is returned unchanged."""
+    namespace, colon, base_name = name.rpartition(":")
+    return namespace + colon + bpy.utils.flip_name(base_name)
+
+
+class Mirror:
+    """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right side.
+
+    Attributes:
+        partner_paths: the RNA path on the other side, by datablock and RNA path of each number that is exchanged.
+    """
+
+    def __init__(self, armature_object: bpy.types.Object, animated_numbers: Iterable[tuple[bpy.types.ID, str]] = ()):
+        """Prepare to mirror poses.
+
+        Args:
+            animated_numbers: datablocks and RNA paths of numbers to exchange with the other side, in addition to
+                custom properties of bones.
+        """
+        self._armature_object = armature_object
+        indices = {bone.name: index for index, bone in enumerate(armature_object.pose.bones)}
+        self._partner_indices = np.array(
+            [indices.get(flipped_name(name), index) for name, index in indices.items()], int
+        )
+        # Check that each bone is the mirror image of its partner.
+        partner_indices, bones = self._partner_indices, armature_object.data.bones
+        matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
+        tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
+        reflection = np.diag([-1.0, 1.0, 1.0, 1.0])
+        offsets = reflection @ matrices[partner_indices] @ reflection - matrices
+        distances = np.maximum(
+            np.linalg.norm(offsets[:, :3, 3], axis=1),
+            np.linalg.norm(tails[partner_indices] * [-1, 1, 1] - tails, axis=1),
+        )
+        size = float(np.ptp(np.concatenate([matrices[:, :3, 3], tails]), axis=0).max())
+        tolerance = max(MIN_DISTANCE_TOLERANCE / metres_per_unit(armature_object), RELATIVE_DISTANCE_TOLERANCE * size)
+        is_apart = (distances > tolerance) | (np.linalg.norm(offsets[:, :3, :3], axis=1).max(axis=1) > AXIS_TOLERANCE)
+        for index, bone in enumerate(armature_object.pose.bones):
+            partner, expected_name = armature_object.pose.bones[int(partner_indices[index])], flipped_name(bone.name)
+            if not is_apart[index] and bone.rotation_mode == partner.rotation_mode:
+                continue
+            problem = f"the bone '{bone.name}' differs from its mirror image; bring it into the middle"
+            if partner != bone:
+                problem = (
+                    f"the bones '{bone.name}' and '{partner.name}' differ in place, roll, direction or rotation mode; "
+                    "symmetrize the armature"
+                )
+            elif expected_name != bone.name:
+                problem = f"there is no bone '{expected_name}' for '{bone.name}'; add it"
+            raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
+        escape = bpy.utils.escape_identifier
+        paths = {
+            (armature_object, f'{bone.path_from_id()}["{escape(key)}"]')
+            for bone in armature_object.pose.bones
+            for key in bone.keys()  # noqa: SIM118
+        }
+        self.partner_paths: dict[tuple[bpy.types.ID, str], str] = {}
+        for datablock, path in {*paths, *animated_numbers}:
+            partner_path = flipped_path(path)
+            if partner_path != path and is_number(datablock, path) and is_number(datablock, partner_path):
+                self.partner_paths |= {(datablock, path): partner_path, (datablock, partner_path): path}
+
+    def apply(self) -> None:
+        """Mirror the current pose and numbers without evaluating them."""
+        bones = self._armature_object.pose.bones
+        for channel in POSE_CHANNELS:
+            write(bones, channel, read(bones, channel)[self._partner_indices] * np.float32(_MIRROR_SIGNS[channel.name]))
+        values = {number: number[0].path_resolve(partner) for number, partner in self.partner_paths.items()}
+        for (datablock, path), value in values.items():
+            set_value(datablock, path, value)
+        for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
+            # Custom properties do not tag their datablock.
+            datablock.update_tag()
+
+
+def flipped_path(path: str) -> str:
+    """Return an RNA path for the other side."""
+
+    def flip(match: re.Match) -> str:
+        return f'["{bpy.utils.escape_identifier(flipped_name(bpy.utils.unescape_identifier(match[1])))}"]'
+
+    return _QUOTED_NAME.sub(flip, path)
 
 
 @dataclass(frozen=True)
@@ -71,14 +175,25 @@ class ClipPlayer:
         self.armature_objects = list(dict.fromkeys([armature_object, *filter(is_armature.get, animated_datablocks)]))
         self.other_datablocks = [d for d in animated_datablocks if not is_armature[d]]
         self._idle_states: list[AnimationState] | None = None
-        channels = {channel.name for channel in POSE_CHANNELS}
         animated_numbers = {
             (datablock, path): value
             for datablock in (*self.armature_objects, *self.other_datablocks)
             for path, value in animated_values(datablock, actions_of_clips(clips, datablock)).items()
             # `clear_pose` resets the channels of a pose.
-            if not (path.startswith("pose.bones[") and path.rpartition(".")[2] in channels)
+            if not (path.startswith("pose.bones[") and path.rpartition(".")[2] in _MIRROR_SIGNS)
         }
+        self._mirrors: list[Mirror] = []
+        if any(clip.is_mirrored for clip in clips):
+            # Armatures that only follow the animated ones need not be symmetric.
+            mirrored = [a for a in self.armature_objects if a in animated_datablocks] or [armature_object]
+            for armature in mirrored:
+                others = {*mirrored, *(self.other_datablocks if armature != mirrored[0] else ())} - {armature}
+                self._mirrors.append(Mirror(armature, [key for key in animated_numbers if key[0] not in others]))
+            animated_numbers |= {
+                (datablock, path): datablock.path_resolve(path)
+                for mirror in self._mirrors
+                for datablock, path in mirror.partner_paths
+            }
         self._numbers: PropertyValues = animated_numbers
         self._controls: list[tuple[SceneRig, str, float]] = []
         for scene_rig, names in rigs:
@@ -90,7 +205,12 @@ class ClipPlayer:
         """Show a frame of a clip."""
         if clip != self._clip:
             self.start(clip)
+        elif clip.is_mirrored:
+            self.reset_pose()
         bpy.context.scene.frame_set(frame)
+        if clip.is_mirrored:
+            for mirror in self._mirrors:
+                mirror.apply()
 
     @property
     def current_clip_frame(self) -> ClipFrame:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reads the frames of actions from which random poses combine limbs (`core.mathematics.remix`)."""
 
-import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
@@ -34,6 +33,7 @@ from .action_range import (
     keyed_numbers,
     measured_ranges,
 )
+from .clip_player import flipped_name, flipped_path
 from .motion_range import limited_bones
 
 REMIX = "remix"
@@ -43,7 +43,6 @@ MAX_FRAMES = 3000
 _REFLECTION = np.diag([-1.0, 1.0, 1.0])
 HEAD_TOLERANCE = 0.01
 """Largest distance between the head of a bone and its mirror image, relative to the size of the armature."""
-_QUOTED_NAME = re.compile(r'\["((?:[^"\\]|\\.)*)"\]')
 _REST_VALUES = {ROTATION_VECTOR: 0.0, LOCATION: 0.0, SCALE: 1.0}
 
 
@@ -146,9 +145,9 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
         bone_path = path[: path.find('"]') + 2]
         bone = bones_by_path.get(bone_path)
         if mirror:
-            image_path = _flipped_path(path) if bone is None else path
+            image_path = flipped_path(path) if bone is None else path
             if bone is not None and bone.name in mirror:
-                image_path = mirror[bone.name].path_from_id() + _flipped_path(path.removeprefix(bone_path))
+                image_path = mirror[bone.name].path_from_id() + flipped_path(path.removeprefix(bone_path))
             values = np.concatenate([values, numbers.get((owner, image_path), values)])
         limb = len(bones) if bone is None else limbs[bone.name]
         columns.append((Channel(f"{owner}/{path}", CONTROL, 0, *_bounds(values)), values, limb, False))
@@ -159,21 +158,6 @@ def _read_remix(scene_rig: SceneRig, actions: Sequence[bpy.types.Action]) -> Rem
         )
     channels, values, channel_limbs, has_noise = zip(*columns, strict=True)
     return Remix(channels, np.stack(values, axis=1), np.array(channel_limbs, np.int64), np.array(has_noise, bool))
-
-
-def flipped_name(name: str) -> str:
-    """Return the name for the other side, such as `arm.R` for `arm.L`; a name without a side is returned unchanged."""
-    namespace, colon, base_name = name.rpartition(":")
-    return namespace + colon + bpy.utils.flip_name(base_name)
-
-
-def _flipped_path(path: str) -> str:
-    """Return an RNA path for the other side."""
-
-    def flip(match: re.Match) -> str:
-        return f'["{bpy.utils.escape_identifier(flipped_name(bpy.utils.unescape_identifier(match[1])))}"]'
-
-    return _QUOTED_NAME.sub(flip, path)
 
 
 def _parents(bones: Sequence[bpy.types.PoseBone]) -> list[int]:

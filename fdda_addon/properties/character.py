@@ -157,6 +157,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     learn_from: make_property(settings.LEARN_FROM)
     pre_roll: make_property(settings.PRE_ROLL)
     settle_frames: make_property(settings.SETTLE_FRAMES)
+    mirror: make_property(settings.MIRROR)
     recording: StringProperty(
         name="Folder",
         description="Folder of the recording. Empty for a folder next to the .blend file",

@@ -27,6 +27,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
     settings = scene_rig.mesh_object.fdda.settings
     actions = recorded_actions(scene_rig)
     values = values_from(settings, settings_of(RecordingSettings))
+    values["mirror"] &= bool(actions)
     if settings.auto_poses:
         values["poses"] = POSES.default
     return RecordingSettings(

@@ -12,7 +12,7 @@ from ..core.mathematics.poses import CONTROL, Channel, Overshoot, make_overshoot
 from ..core.mathematics.remix import PoseSampler
 from ..core.recording.index import INDEX_NAME, POSE, RANDOM, Sampling, Source, read_index, read_info
 from ..core.rig import Rig
-from ..core.settings import AUTO_POSES, MAX_AUTO_POSES, OVERSHOOT, POSES, SEED, SPREAD
+from ..core.settings import AUTO_POSES, MAX_AUTO_POSES, MIRROR, OVERSHOOT, POSES, SEED, SPREAD
 from ..poses.clip import find_clips
 from ..poses.remix import REMIX, read_remix
 from ..poses.sample_selection import SampleSelection, select_bones, split_control_bones
@@ -51,6 +51,7 @@ class RecordingSettings:
         overshoot: factor that widens the range of motion for some random poses (`mathematics.poses.make_overshoot`); 1
             for none.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
+        mirror: record each of these frames a second time, mirrored.
         influence_poses: number of base poses from which joints are moved alone, to find what they influence.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.
@@ -71,6 +72,7 @@ class RecordingSettings:
     bones_to_pose: tuple[str, ...] = ()
     extra_inputs: tuple[str, ...] = ()
     strips: tuple[str, ...] = ()
+    mirror: bool = MIRROR.field()
     target: TargetSettings = NO_TARGET
     overwrite: bool = False
 
@@ -201,7 +203,7 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     """Make the description of the poses of a recording with these settings."""
     name = REMIX if REMIX in settings.bones_to_pose else ""
     sources = [Source(RANDOM, settings.poses, name)] if settings.poses else []
-    clips = find_clips([scene_rig], settings.actions, settings.strips)
+    clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     sampled_channels_of_recording = channels if settings.poses else ()
     overshoot = make_recording_overshoot(scene_rig, settings, sampled_channels_of_recording)

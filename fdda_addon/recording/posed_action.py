@@ -10,7 +10,7 @@ import numpy as np
 from ..core.errors import RigError
 from ..core.mathematics.poses import CONTROL, ROTATION_VECTOR, bones_with_changed_range
 from ..core.progress import Job, Progress
-from ..core.recording.index import ACTION, RANDOM, STRIP, RecordingInfo
+from ..core.recording.index import ACTION, MIRRORED, RANDOM, STRIP, RecordingInfo
 from ..poses.clip import find_clips
 from ..poses.clip_player import ClipPlayer
 from ..poses.remix import REMIX
@@ -43,6 +43,7 @@ def recorded_settings(info: RecordingInfo) -> RecordingSettings:
         overshoot=sampling.overshoot.factor if sampling.overshoot else 1.0,
         actions=names[ACTION],
         strips=names[STRIP],
+        mirror=any(source.kind == MIRRORED for source in sampling.sources),
         bones_to_pose=(REMIX,) if REMIX in names[RANDOM] else (),
     )
 
@@ -68,7 +69,7 @@ def make_posed_action(
     rig, channels = read_sampled_rig(scene_rig, settings)
     if info:
         channels = info.sampling.channels
-        kinds = {RANDOM, ACTION, STRIP}
+        kinds = {RANDOM, ACTION, STRIP, MIRRORED}
         recorded = replace(info.sampling, sources=tuple(s for s in info.sampling.sources if s.kind in kinds))
         remix = make_pose_sampler(scene_rig, settings).remix
         recorded_limbs, limbs = (
@@ -81,7 +82,7 @@ def make_posed_action(
                 f"'{scene_rig.mesh_object.name}' does not give the recorded poses any more: its actions or locked "
                 "axes have changed; record again, or leave --recording out."
             )
-    clips = find_clips([scene_rig], settings.actions, settings.strips)
+    clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
     plan = PosePlan(scene_rig, channels, settings, clips)
     if plan.total < 1:
         raise RigError("There is no pose: 0 random poses and no action; give --poses or --action.")

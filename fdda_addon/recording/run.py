@@ -118,7 +118,9 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         RecordingError: the folder has a recording already, or the recording to resume differs.
         OutputError: the folder cannot be written, or the disk has too little space.
     """
-    clips = find_clips([scene_rig], settings.actions, settings.strips)
+    clips = find_clips([scene_rig], settings.actions, settings.strips, settings.mirror)
+    if settings.mirror and not clips:
+        raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
     if settings.target.name and scene_rig.other_meshes:
         raise RecordingError("A target belongs to one mesh; record each mesh by itself, with its target.")
     stacks = []

@@ -237,12 +237,17 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
     """Check that a target has the frames of clips, and that a pre-roll is possible.
 
     Raises:
-        RigError: the target lacks frames, or cannot use the pre-roll.
+        RigError: the target lacks frames, shows no mirrored frames, or cannot use the pre-roll.
     """
     if pre_roll and not target.simulations:
         raise RigError(
             f"The target '{target.name}' is no simulation, so there is nothing that a pre-roll would change; leave it "
             "out."
+        )
+    if target.follows != POSE and (mirrored_clips := [clip for clip in clips if clip.is_mirrored]):
+        raise RigError(
+            f"The target '{target.name}' shows the frames of '{mirrored_clips[0].name}' as they are, and not mirrored; "
+            "leave the mirrored frames out."
         )
     for clip in clips:
         for cache in target.caches:

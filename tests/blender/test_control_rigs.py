@@ -27,7 +27,7 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from .baked_files import predicted_in_frames, read_baked
 from .conftest import ELBOW_RIG, Trained, assert_plays, run, train
 from .figure import FRAMES, WAVE, add_wave, build_figure
-from .poses.test_animation_poses import positions_in_frames, positions_of, record_and_read
+from .poses.test_animation_poses import mirrored, positions_in_frames, positions_of, record_and_read
 from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
@@ -185,7 +185,7 @@ def test_a_control_armature_is_baked_and_evaluated(elbow_files, tmp_path):
     assert np.abs(read_baked(tmp_path / "wave.abc", range(1, 31)) - expected).max() < 1e-6
 
 
-def test_strips_and_frames_of_a_control_armature(tmp_path):
+def test_strips_and_mirrored_frames_of_a_control_armature(tmp_path):
     rig = build_figure()
     wave = add_wave(rig)
     control = add_control_armature(rig)
@@ -193,8 +193,9 @@ def test_strips_and_frames_of_a_control_armature(tmp_path):
     control.animation_data.action = None
     control.pose.bones[0].location = (0, 0, 0)
     shown = positions_in_frames(rig, range(40, 40 + FRAMES))
-    recording = record_and_read(rig, tmp_path / "strip", strips=(strip.name,))
-    np.testing.assert_allclose(positions_of(recording), shown, atol=1e-5)
+    recording = record_and_read(rig, tmp_path / "strip", strips=(strip.name,), mirror=True)
+    np.testing.assert_allclose(positions_of(recording)[:FRAMES], shown, atol=1e-5)
+    np.testing.assert_allclose(positions_of(recording)[FRAMES:], mirrored(rig, shown), atol=1e-5)
     recording = record_and_read(rig, tmp_path / "action", actions=(WAVE,))
     np.testing.assert_allclose(positions_of(recording), shown, atol=1e-5)
 

@@ -14,7 +14,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.formats.messages import Message, MessageType
 from fdda_addon.core.formats.report import Verdict
 from fdda_addon.core.mathematics.poses import Overshoot
-from fdda_addon.core.recording.index import ACTION, RANDOM, REFINED, Source
+from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.skinned import SkinnedRecording
 from fdda_addon.core.settings import automatic_passes
 from trainer.__main__ import main
@@ -152,6 +152,14 @@ def test_frames_do_not_change_the_split_of_random_poses(four_poses):
     result = part_of_each_pose(split(four_poses, Source(RANDOM, 100), Source(ACTION, 120, "walk", (1, 1))), 220)
     assert np.array_equal(result[:100], expected)
     assert set(result[100:]) == {0, 1, 2}
+
+
+def test_a_frame_and_its_mirror_image_are_in_one_part(four_poses):
+    walk, run = Source(ACTION, 95, "walk", (1, 1)), Source(ACTION, 60, "run", (5, 1))
+    sources = (walk, replace(walk, kind=MIRRORED), run, replace(run, kind=MIRRORED))
+    parts = part_of_each_pose(split(four_poses, *sources), 310)
+    assert np.array_equal(parts[:95], parts[95:190]) and np.array_equal(parts[190:250], parts[250:])
+    assert set(parts[:190]) | set(parts[190:]) == {0, 1, 2}
 
 
 def test_short_animations_have_shorter_blocks(four_poses):

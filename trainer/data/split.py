@@ -102,7 +102,7 @@ def split_recording(recording: SkinnedRecording, config: TrainingConfig) -> Spli
 
 
 def _frame_blocks(sources: tuple[Source, ...]) -> list[list[int]]:
-    """Group the poses of actions into blocks of consecutive frames.
+    """Group the poses of actions into blocks of consecutive frames; a frame and its mirror image share a block.
 
     Short animations have shorter blocks, so that some can be held out.
     """

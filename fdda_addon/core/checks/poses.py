@@ -6,12 +6,12 @@ import hashlib
 import numpy as np
 
 from ..mathematics.skinning import skin_matrices
-from ..recording.index import ACTION, STRIP
+from ..recording.index import ACTION, MIRRORED, STRIP
 from ..recording.skinned import SkinnedRecording
 from ..wording import format_with_noun
 from .warning import RecordingWarning, format_length
 
-_SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip"}
+_SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
 """Labels of the sources of frames in messages."""
 POSE_TOLERANCE = 1e-5
 """Poses are equal when their elements (meters, no unit, or a control's unit) round to the same multiple of this."""

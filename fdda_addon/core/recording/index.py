@@ -22,8 +22,9 @@ MAX_INDEX_BYTES = 16 << 20
 """Largest size of either file."""
 MAX_INFLUENCES = 1000
 """Largest number of skin weights of a vertex."""
-RANDOM, ACTION, STRIP = "random", "action", "strip"
-"""Kinds of sources of poses: random poses, frames of an action, and frames of an NLA strip."""
+RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
+"""Kinds of sources of poses: random poses, frames of an action, frames of an NLA strip, and the mirrored frames of the
+previous source."""
 REFINED = "refined"
 """Kind of source for poses that a refinement added where a model had large errors.
 
@@ -32,7 +33,7 @@ ALONE = "alone"
 """Kind of source for poses in which one input moves alone from a base pose (`AloneMoves`).
 
 They show what each input influences; nothing is trained on them."""
-SOURCE_KINDS = (RANDOM, ACTION, STRIP, ALONE, REFINED)
+SOURCE_KINDS = (RANDOM, ACTION, STRIP, MIRRORED, ALONE, REFINED)
 JOINT = "joint"
 """Kind of an input that is a joint; the other kind is `CONTROL`."""
 
@@ -143,7 +144,7 @@ class Source:
     Attributes:
         kind: one of `SOURCE_KINDS`.
         poses: number of poses.
-        name: name of the action or strip; file name of the model for refined poses; empty for
+        name: name of the action or strip, also for mirrored frames; file name of the model for refined poses; empty for
             others.
         frames: first frame of the action or strip, and number of frames between poses; (0, 0) for other poses.
     """

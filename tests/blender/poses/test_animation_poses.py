@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recording and evaluation of actions and NLA strips, and of shape keys that actions animate."""
+"""Recording and evaluation of actions and NLA strips, also mirrored, and of shape keys that actions animate."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.errors import RigError
+from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.progress import run_job
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.evaluation.run import evaluate
@@ -18,7 +18,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
 from ..conftest import Trained, build_and_train, evaluated_positions, run
-from ..figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, key_channel
+from ..figure import ARM_REACH, FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key_channel
 from ..refusals import file_contents
 from ..scene_state import assert_same_state, drain, scene_state
 
@@ -48,6 +48,14 @@ def positions_in_frames(rig: SceneRig, frames) -> np.ndarray:
         bpy.context.scene.frame_set(frame)
         positions_by_frame.append(evaluated_positions(rig.mesh_object))
     return np.array(positions_by_frame)
+
+
+def mirrored(rig: SceneRig, points: np.ndarray) -> np.ndarray:
+    """Mirror positions (F, V, 3) across X; each vertex gets the position of the vertex on the other side."""
+    rest = np.array([vertex.co[:] for vertex in rig.mesh_object.data.vertices])
+    distances = np.linalg.norm(rest[:, None] * [-1, 1, 1] - rest[None], axis=-1)
+    assert distances.min(axis=1).max() < 1e-6
+    return points[:, distances.argmin(axis=1)] * [-1, 1, 1]
 
 
 def add_strips(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: str = "swing") -> bpy.types.NlaStrip:
@@ -97,6 +105,68 @@ def test_a_recorded_strip_includes_the_tracks_below_it(figure, tmp_path):
     np.testing.assert_allclose(positions_of(recording), shown, atol=1e-5)
     action_recording = record_and_read(figure, tmp_path / "action", actions=(WAVE,))
     assert np.abs(positions_of(action_recording) - shown).max() > 0.05, "the strip includes the track below"
+
+
+def test_mirrored_frames_are_the_mirror_images(figure, tmp_path):
+    shown = positions_in_frames(figure, range(1, FRAMES + 1))
+    before = scene_state(figure)
+    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
+    assert_same_state(before, scene_state(figure))
+    assert [(s.kind, s.poses, s.name, s.frames) for s in recording.info.sampling.sources[:-1]] == [
+        ("action", FRAMES, WAVE, (1, 1)),
+        ("mirrored", FRAMES, WAVE, (1, 1)),
+    ]
+    recorded_positions = positions_of(recording)
+    np.testing.assert_allclose(recorded_positions[:FRAMES], shown, atol=1e-5)
+    np.testing.assert_allclose(recorded_positions[FRAMES:], mirrored(figure, shown), atol=1e-5)
+    assert np.abs(recorded_positions[FRAMES:] - recorded_positions[:FRAMES]).max() > 0.1
+
+
+def test_mirrored_strips_are_the_mirror_images(figure, tmp_path):
+    add_strips(figure, bpy.data.actions[WAVE])
+    shown = positions_in_frames(figure, range(40, 40 + FRAMES))
+    recording = record_and_read(figure, tmp_path / "recording", strips=("swing",), mirror=True)
+    np.testing.assert_allclose(positions_of(recording)[FRAMES:], mirrored(figure, shown), atol=1e-5)
+
+
+def test_mirroring_exchanges_controls_of_left_and_right_bones(figure, tmp_path):
+    """The left control is keyed, and the right control is constant."""
+    figure.armature_object.pose.bones["arm.R"]["fist"] = 0.25
+    names = [f'armature_object/pose.bones["arm.{side}"]["fist"]=0:1' for side in "LR"]
+    before = scene_state(figure)
+    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True, extra_inputs=tuple(names))
+    assert_same_state(before, scene_state(figure))
+    controls = np.array(recording.controls[: 2 * FRAMES])
+    assert np.ptp(controls[:FRAMES, 0]) > 0.9 and (controls[:FRAMES, 1] == 0.25).all()
+    np.testing.assert_array_equal(controls[FRAMES:], controls[:FRAMES, ::-1])
+
+
+def test_mirroring_refuses_asymmetric_rigs(figure, tmp_path):
+    def refusal() -> str:
+        with pytest.raises(RigError) as error:
+            record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
+        assert not (tmp_path / "recording").exists()
+        return str(error.value)
+
+    bones = figure.armature_object.pose.bones
+    bones["arm.R"].rotation_mode = "XYZ"
+    differ = "the bones 'arm.L' and 'arm.R' differ in place, roll, direction or rotation mode; symmetrize the armature"
+    assert differ in refusal()
+    bones["arm.R"].rotation_mode = "QUATERNION"
+    edit_bones(figure, lambda edited: setattr(edited["arm.R"], "roll", edited["arm.R"].roll + 0.2))
+    assert differ in refusal()
+    edit_bones(figure, lambda edited: edited["arm.R"].align_roll((0, -1, 0)))
+    edit_bones(figure, lambda edited: setattr(edited["arm.R"], "tail", (-ARM_REACH - 0.01, 0, 0.9)))
+    assert differ in refusal()
+    edit_bones(figure, lambda edited: edited.remove(edited["arm.R"]))
+    assert "there is no bone 'arm.R' for 'arm.L'; add it, or leave mirroring out." in refusal()
+    edit_bones(figure, lambda edited: setattr(edited["spine"], "head", (0.1, 0, 0)))
+    assert "the bone 'spine' differs from its mirror image; bring it into the middle" in refusal()
+
+
+def test_mirroring_without_animation_is_refused(figure, tmp_path):
+    with pytest.raises(RecordingError, match="nothing to mirror: no action and no strip; give --action or --strip"):
+        record_and_read(figure, tmp_path / "recording", poses=3, mirror=True)
 
 
 def test_strips_that_are_missing_or_muted_are_refused(figure, tmp_path):
@@ -154,17 +224,17 @@ def test_random_controls_are_reset_before_actions(figure, tmp_path):
 
 
 def test_resumed_recordings_have_the_same_bytes_and_restore_the_scene(figure, tmp_path):
-    """Recording stops during the random poses, those beyond the limits, the action, and the strip."""
+    """Recording stops during the random poses, those beyond the limits, the action, and the mirrored action."""
     add_strips(figure, bpy.data.actions[WAVE])
     limits = [bone.constraints.new("LIMIT_ROTATION") for bone in figure.armature_object.pose.bones]
     for constraint in limits:
         constraint.owner_space, constraint.use_limit_x, constraint.max_x = "LOCAL", True, 0.5
     name = 'armature_object/pose.bones["arm.R"]["fist"]=0:1'
-    settings = {"poses": 12, "overshoot": 2.0, "actions": (WAVE,), "strips": ("swing",)}
+    settings = {"poses": 12, "overshoot": 2.0, "actions": (WAVE,), "strips": ("swing",), "mirror": True}
     settings = RecordingSettings(**settings, influence_poses=1, extra_inputs=(name,))
     before = scene_state(figure)
     drain(record(figure, tmp_path / "whole", settings))
-    for stop_pose in (5, 10, 30, 40):
+    for stop_pose in (5, 10, 30, 57):
         resumed = tmp_path / f"resumed from {stop_pose}"
         steps = record(figure, resumed, settings)
         for step in steps:
@@ -173,7 +243,7 @@ def test_resumed_recordings_have_the_same_bytes_and_restore_the_scene(figure, tm
         assert_same_state(before, scene_state(figure))
         assert not any(constraint.mute for constraint in limits)
         index = json.loads((resumed / "recording.json").read_text())
-        assert stop_pose <= index["complete"] < index["poses"] and index["poses"] > 12 + 2 * FRAMES
+        assert stop_pose <= index["complete"] < index["poses"] and index["poses"] > 12 + 4 * FRAMES
         drain(record(figure, resumed, replace(settings, resume=True)))
         assert file_contents(resumed) == file_contents(tmp_path / "whole")
 
@@ -186,7 +256,7 @@ def trained(tmp_path_factory) -> Trained:
         rig = build_figure()
         add_strips(rig, add_wave(rig))
 
-    options = ("--poses", 0, "--action", WAVE)
+    options = ("--poses", 0, "--action", WAVE, "--mirror")
     return build_and_train(tmp_path_factory.mktemp("figure"), build, *options, training=("--passes", 30))
 
 

@@ -218,6 +218,7 @@ COPY, PC2 = targets.target_copy, targets.target_pc2
         (COPY, None, ("--settle-frames", 5), "cannot settle: it follows the pose at once;"),
         (PC2, None, ("--poses", 0, "--settle-frames", 5), "'flesh' cannot settle: the modifier 'Cache' of 'flesh'"),
         (PC2, None, ("--pre-roll", 5), "The target 'flesh' is no simulation, so there is nothing"),
+        (PC2, None, ("--mirror",), f"The target 'flesh' shows the frames of '{ACTION}' as they are, and not"),
         (PC2, None, ("--poses", 5), "(the modifier 'Cache' of 'flesh'), so it cannot show random poses; record 0"),
         (
             PC2,
