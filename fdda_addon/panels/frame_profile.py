@@ -47,6 +47,7 @@ def _draw_parts(layout: bpy.types.UILayout, times: Benchmark) -> None:
         ("   Bones", times.median(BONES)),
         ("   Other Objects", max(times.median(WITHOUT_MESHES) - times.median(BONES), 0.0)),
         ("   Network", times.median(INFERENCE)),
+        *((f"   Only {mesh.name}", times.median(mesh.variant)) for mesh in times.meshes if mesh.variant in times.times),
     ]
     grid = layout.column(align=True)
     for label, ms in rows:

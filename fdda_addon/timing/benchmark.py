@@ -62,7 +62,7 @@ LABELS = {
 
 
 @dataclass(frozen=True)
-class MeasuredMesh:
+class MeshTimes:
     """A mesh of a character.
 
     Attributes:
@@ -76,6 +76,11 @@ class MeasuredMesh:
     vertices: int
     has_model: bool = False
     reason: str = ""
+
+    @property
+    def variant(self) -> str:
+        """Return the variant with the model of this mesh alone; a mesh may have the name of another variant."""
+        return _only(self.name)
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ class Benchmark:
     """
 
     armature: str
-    meshes: tuple[MeasuredMesh, ...]
+    meshes: tuple[MeshTimes, ...]
     model_count: int
     frames: int
     times: Mapping[str, list[float]]
@@ -195,7 +200,9 @@ class Benchmark:
             **{
                 variant: {"median": _round(self.median(variant)), "p90": _round(np.percentile(times, 90))}
                 for variant, times in self.times.items()
+                if variant in LABELS
             },
+            "model_alone": {m.name: _round(self.median(m.variant)) for m in self.meshes if m.variant in self.times},
             "ratio": _round(self.ratio),
             "ratio_quartiles": [_round(ratio) for ratio in self.quartiles],
             "is_faster": self.ratio > 1,
@@ -206,15 +213,29 @@ class Benchmark:
         """Format the times as tables, followed by a verdict."""
         names = f"{format_count(len(self.meshes), 'mesh', 'meshes')} of {self.armature}, ms per frame"
         lines = [f"{names:<37}{'median':>10}{'p90':>10}"]
-        for variant, times in self.times.items():
+        for variant, times in ((variant, times) for variant, times in self.times.items() if variant in LABELS):
             lines.append(f"  {LABELS[variant]:<35}{self.median(variant):>10.3f}{np.percentile(times, 90):>10.3f}")
         lines.append(f"{'part of a frame, ms':<37}{'rig':>17}{'FDDA':>17}")
         rig, fdda = self.median(RIG), self.median(FDDA)
         for label, before, after in self.shares:
             lines.append(f"  {label:<35}{before:>10.3f} {before / rig:>5.0%}{after:>11.3f} {after / fdda:>5.0%}")
-        for mesh in (mesh for mesh in self.meshes if not mesh.has_model):
-            lines.append(f"  {mesh.name} ({mesh.vertices:,} vertices): {mesh.reason or 'no model'}")
+        lines += [f"  {line}" for line in self.mesh_lines()]
         return "\n".join([*lines, f"  {self.sentence}"])
+
+    def mesh_lines(self) -> list[str]:
+        """Return a line for each mesh of several."""
+        lines = []
+        for mesh in self.meshes if len(self.meshes) > 1 else ():
+            text = mesh.reason or ("" if mesh.has_model else "no model")
+            if mesh.variant in self.times:
+                ms = self.median(mesh.variant)
+                text = f"its model alone {ms:.2f} ms, {self.median(RIG) / ms:.1f}x as fast"
+            lines.append(f"{mesh.name} ({mesh.vertices:,} vertices): {text or 'the only model'}")
+        return lines
+
+
+def _only(mesh_name: str) -> str:
+    return f"only {mesh_name}"
 
 
 def _round(value: float) -> float:
@@ -285,6 +306,8 @@ def benchmark(
         }
         if all(armature_modifier(mesh_object) is None for mesh_object in meshes):
             del show[LINEAR]
+        if len(rigs) > 1 and len(meshes) > 1:
+            show |= {_only(mesh_object.name): partial(_models_shown, [mesh_object]) for mesh_object in meshes}
         times: dict[str, list[float]] = {variant: [] for variant in show}
         rounds: dict[str, list[float]] = {variant: [] for variant in show}
         frames_per_round = max(1, -(-frames // ROUNDS))
@@ -302,7 +325,7 @@ def benchmark(
         # Meshes may share a model, which runs once.
         networks = list(dict.fromkeys(network.model for network in networks))
         times[INFERENCE] = list(np.sum([_inference_times(network, frames) for network in networks], axis=0))
-    described = [MeasuredMesh(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
+    described = [MeshTimes(o.name, len(o.data.vertices), o in meshes, reasons.get(o, "")) for o in mesh_objects]
     return Benchmark(
         armature_object.name,
         tuple(sorted(described, key=lambda mesh: -mesh.vertices)),

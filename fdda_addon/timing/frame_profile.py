@@ -24,7 +24,7 @@ from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig, check_full_rig, rigs_of_armature
 from ..scene.temporary_state import temporary_attributes
 from .animation import main_rig, temporary_animation
-from .benchmark import Benchmark, benchmark
+from .benchmark import RIG, Benchmark, benchmark
 from .durations import Duration, frame_ms, temporary_armature_scene, time_redraws
 
 ROUNDS = 5
@@ -175,13 +175,16 @@ class FrameProfile:
         if self.times is None:
             sentences.append(f"No model can replace the rig: {self.model_problem}")
         else:
-            times = self.times
+            times, rig_ms = self.times, self.times.median(RIG)
             subject = "All" if times.model_count == len(times.meshes) else f"{times.model_count} of {len(times.meshes)}"
             subject = "The model" if len(times.meshes) == 1 else f"{subject} meshes with models"
             sentences.append(f"{subject}: {frame_ms / times.ratio:.2f} ms. {times.sentence}")
             for mesh in times.meshes if len(times.meshes) > 1 else ():
                 if mesh.reason:
                     sentences.append(f"{mesh.name} has no model: {mesh.reason}")
+                elif mesh.variant in times.times:
+                    ms = frame_ms * times.median(mesh.variant) / rig_ms
+                    sentences.append(f"Only {mesh.name} with a model: {ms:.2f} ms.")
         if self.fast_rig is not None:
             sentences.append(self.fast_rig.describe(frame_ms))
         elif self.fast_rig_problem:

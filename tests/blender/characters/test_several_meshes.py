@@ -12,6 +12,7 @@ import pytest
 import fdda_addon
 from blend_fixtures.characters.meshes import body_and_sleeve
 from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.timing.benchmark import RIG
 
 from ..conftest import CommandOutput, assert_plays, output_of, pose, run
 from ..refusals import Refusal, file_contents
@@ -101,19 +102,21 @@ def test_evaluation_is_by_object_and_the_benchmark_by_character(two, tmp_path, c
         report = json.loads(times.read_text())
         assert report["vertices"] == 600 and not report["is_estimate"]
         assert [(mesh["name"], mesh["has_model"]) for mesh in report["meshes"]] == [(BODY, True), (SLEEVE, True)]
+        assert set(report["model_alone"]) == {BODY, SLEEVE}
+        assert "sleeve (300 vertices): its model alone " in capfd.readouterr().out
 
 
 def test_an_estimate_includes_meshes_without_an_armature_modifier_and_names_others(two, tmp_path, capfd):
-    """A skirt follows the body by Surface Deform, and a bow is not bound to it."""
+    """A skirt with the name of a measured variant follows the body by Surface Deform, and a bow is not bound to it."""
 
     def add_followers() -> None:
         body = bpy.data.objects[BODY]
-        for name in ("skirt", "bow"):
+        for name in (RIG, "bow"):
             follower = bpy.data.objects.new(name, bpy.data.objects[SLEEVE].data.copy())
             bpy.context.scene.collection.objects.link(follower)
             modifier = follower.modifiers.new("Follow", "SURFACE_DEFORM")
             modifier.target = body
-            if name == "skirt":
+            if name == RIG:
                 with bpy.context.temp_override(object=follower, active_object=follower):
                     assert bpy.ops.object.surfacedeform_bind(modifier="Follow") == {"FINISHED"}
 
@@ -124,15 +127,16 @@ def test_an_estimate_includes_meshes_without_an_armature_modifier_and_names_othe
     assert {mesh["name"]: mesh["has_model"] for mesh in report["meshes"]} == {
         BODY: True,
         SLEEVE: True,
-        "skirt": True,
+        RIG: True,
         "bow": False,
     }
-    assert report["is_estimate"]
+    assert report["is_estimate"] and set(report["model_alone"]) == {BODY, SLEEVE, RIG}
+    assert report["model_alone"][RIG] != report[RIG]["median"]
     assert "bow (300 vertices): Modifier 'Follow' of 'bow' is not bound, so it does nothing; bind it first" in output
     assert run("benchmark", clothed, "--profile", "--json", times, "--overwrite") == 0
     profile, output = json.loads(times.read_text())["profile"], capfd.readouterr().out
     assert profile["models"]["vertices"] == 1200 and {part["object"] for part in profile["parts"]} >= {BODY, SLEEVE}
-    assert "3 of 4 meshes with models: " in output
+    assert "3 of 4 meshes with models: " in output and f"Only {SLEEVE} with a model: " in output
 
 
 def changed(two: Files, path: Path, change) -> Path:
@@ -150,7 +154,7 @@ def test_a_mesh_that_fails_loses_no_times_of_others(two, tmp_path, capfd):
     moved = changed(two, tmp_path / "moved.blend", move_vertex)
     assert run("benchmark", moved, two.models, "--json", times, "--frames", 2) == 1
     output = capfd.readouterr()
-    assert "was trained for another rig" in output.err and "sleeve (300 vertices)" in output.out
+    assert "was trained for another rig" in output.err and "elbow (300 vertices)" in output.out
     meshes = {mesh["name"]: mesh for mesh in json.loads(times.read_text())["meshes"]}
     assert meshes[BODY]["has_model"] and "was trained for another rig" in meshes[SLEEVE]["reason"]
 

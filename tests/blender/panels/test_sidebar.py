@@ -31,7 +31,7 @@ from fdda_addon.rig.dependencies import read_dependencies
 from fdda_addon.scene import draw_cache
 from fdda_addon.scene.compatibility import is_selected
 from fdda_addon.scene.scene_rig import SceneRig
-from fdda_addon.timing.benchmark import Benchmark, MeasuredMesh
+from fdda_addon.timing.benchmark import Benchmark, MeshTimes
 
 from ..conftest import ELBOW, ELBOW_RIG
 from ..drawing import Context, DrawnElement, Layout, texts_of
@@ -231,7 +231,7 @@ def times_of(
     """Return times of a rig that takes 10 ms, and in each round these times with its models, times a factor."""
     medians = {"rig": 10.0, "linear": linear_ms, "fdda": model_ms, "without_meshes": bones_ms, "bones": bones_ms}
     rounds = {name: [ms * (factor if name == "fdda" else 1) for factor in factors] for name, ms in medians.items()}
-    return Benchmark("rig", (MeasuredMesh("body", 100, has_model=True),), 1, 3, rounds, rounds, True)
+    return Benchmark("rig", (MeshTimes("body", 100, has_model=True),), 1, 3, rounds, rounds, True)
 
 
 @pytest.mark.parametrize(
