@@ -11,7 +11,6 @@ from ..core.errors import FDDAError, OutputError, os_error_text
 from ..core.files.output import atomic_write
 from ..core.formats.model import read_model_info
 from ..core.formats.report import page_path, report_path
-from ..core.rig import MeshPart
 from .model_list import add_model
 
 FORMER_FOLDER = "previous"
@@ -26,7 +25,7 @@ def former_model_path(model: Path) -> Path:
 def keep_former_model(model: Path) -> None:
     """Copy a file and its report, which a training will replace; do nothing if the file is missing.
 
-    A former model of another rig, or one that cannot be read, gets another name.
+    A former model of other meshes, or one that cannot be read, gets another name.
 
     Raises:
         OutputError: a file cannot be copied.
@@ -36,10 +35,13 @@ def keep_former_model(model: Path) -> None:
     former_model = former_model_path(model)
     try:
         former_model.parent.mkdir(exist_ok=True)
-        meshes = _meshes(former_model)
-        if former_model.is_file() and (meshes is None or meshes != _meshes(model)):
-            others = (former_model.with_stem(f"{model.stem}-{number}") for number in count(1))
-            former_model.rename(next(path for path in others if not os.path.lexists(path)))
+        if former_model.is_file():
+            if former_model.read_bytes() == model.read_bytes():
+                return  # The training that was to replace it has failed.
+            meshes = _meshes(former_model)
+            if meshes is None or meshes != _meshes(model):
+                others = (former_model.with_stem(f"{model.stem}-{number}") for number in count(1))
+                former_model.rename(next(path for path in others if not os.path.lexists(path)))
         for path in (model, report_path(model), page_path(model)):
             if path.is_file():
                 with atomic_write(former_model.parent / path.name) as temporary_path:
@@ -51,10 +53,10 @@ def keep_former_model(model: Path) -> None:
         ) from error
 
 
-def _meshes(model: Path) -> tuple[MeshPart, ...] | None:
-    """Return the meshes for which a model was trained; None if it cannot be read."""
+def _meshes(model: Path) -> list[tuple[str, int]] | None:
+    """Return names and numbers of vertices of the meshes of a model; None if it cannot be read."""
     try:
-        return read_model_info(model).meshes
+        return [(mesh.name, mesh.vertices) for mesh in read_model_info(model).meshes]
     except FDDAError:
         return None
 
