@@ -82,13 +82,8 @@ TABLE_ROWS = (
     ("rig, ms", lambda r: f"{_median(r, 'rig'):.2f}"),
     ("Armature modifier alone, ms", lambda r: f"{_median(r, 'linear'):.2f}"),
     ("FDDA, ms", lambda r: f"{_median(r, 'fdda'):.2f}"),
-    ("lower bound: FDDA with constant positions, ms", lambda r: f"{_median(r, 'floor'):.2f}"),
     ("the model alone, one pose, ms", lambda r: f"{_median(r, 'inference'):.2f}"),
     ("**rig / FDDA**", lambda r: f"**{r['frame']['ratio']:.2f}**"),
-    (
-        "FDDA / (lower bound + model)",
-        lambda r: f"{_median(r, 'fdda') / (_median(r, 'floor') + _median(r, 'inference')):.2f}",
-    ),
     ("per character in a crowd of 20, ms", lambda r: f"{r['crowd']['ms_a_character']:.2f}"),
     ("… in percent of a single character", lambda r: f"{100 * r['crowd']['ratio']:.0f} %"),
     ("from opening a bound file to its first correct frame, s", lambda r: f"{r['cold_start']['seconds']:.2f}"),

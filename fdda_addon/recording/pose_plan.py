@@ -72,6 +72,8 @@ class PosePlan:
         self._overshoot = make_recording_overshoot(self._scene_rig, settings, self._channels)
         self.in_range_count = settings.poses - (self._overshoot.poses if self._overshoot else 0)
         self._sampler = make_pose_sampler(scene_rig, settings)
+        self._posers: dict[bool, Poser] = {}
+        """What sets poses in the range of motion (True), and poses of the overshoot."""
 
     def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
         """Set the poses with the given indices, one per iteration, and yield each index."""
@@ -110,7 +112,10 @@ class PosePlan:
     def _make_transition(self, index: int) -> Callable[[float], None]:
         """Return a function that blends from the rest pose to a random pose by a factor of 0 to 1."""
         channels, values = self.draw(index)
-        return blend_from_rest(Poser(self._scene_rig, channels).set, channels, values)
+        is_in_range = channels is self._channels
+        if is_in_range not in self._posers:
+            self._posers[is_in_range] = Poser(self._scene_rig, channels)
+        return blend_from_rest(self._posers[is_in_range].set, channels, values)
 
 
 MAX_POSES = 24

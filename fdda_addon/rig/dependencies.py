@@ -18,7 +18,7 @@ from ..core.mathematics.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
 from ..scene.action_slots import CurvesByDatablock, changes_value, curves_of_actions, curves_with_actions, is_overridden
 from ..scene.armature import FOUR_COMPONENT_ROTATIONS
-from ..scene.controls import canonical_path, driven_numbers, fcurve_target, make_control, owner_name
+from ..scene.controls import canonical_path, driven_numbers, fcurve_target, is_number, make_control, owner_name
 from ..scene.scene_rig import SceneRig
 from .references import is_transform_channel, split_bone_path
 from .sources import Sources
@@ -106,7 +106,7 @@ def _channels_read_by_drivers(
     for datablock, path in sources.numbers:
         name, subpath = split_bone_path(datablock, path)
         bone = datablock.pose.bones.get(name) if name and is_transform_channel(subpath) else None
-        if bone is not None and datablock != scene_rig.armature_object:
+        if bone is not None and datablock != scene_rig.armature_object and is_number(datablock, path):
             bounds = _channel_range(bone, *subpath[1:-1].split("["))
             if _can_vary(bounds):
                 yield datablock, path, bounds
