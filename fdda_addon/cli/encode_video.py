@@ -2,6 +2,8 @@
 """`encode-video FOLDER OUT CONTAINER CODEC WIDTH HEIGHT FPS`: encodes the pictures of a film (`evaluation.video`)."""
 
 import argparse
+import os
+import sys
 from pathlib import Path
 
 from ..core.files.stop_signals import exit_on_stop_signal
@@ -24,3 +26,7 @@ def run(options: argparse.Namespace) -> None:
         write_video(
             options.folder, options.out, encoding, size, options.fps, lambda *counts: progress.show("encoding", *counts)
         )
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Nothing is left to do, and Blender 4.5 as a module may hang at its end.
+    os._exit(0)
