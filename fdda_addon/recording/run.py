@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Records the meshes of a rig in the same poses, and writes them in batches."""
+"""Records the meshes of a rig in the same poses, in batches that a thread writes."""
 
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,7 @@ MISSING_WEIGHTS = (
 )
 
 
-BATCH_BYTES = 24 << 20
+BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
 """Largest size of a batch. Batches are small, because a crash loses those that are not written yet."""
 
@@ -74,30 +75,45 @@ class PoseAppender:
         self._evaluator, self._writer, self._pose_setter = evaluator, writer, pose_setter
         self.pose_count = writer.complete
         self._batch_size = max(1, min(BATCH_POSES, BATCH_BYTES // (vertex_count * 12)))
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._pending_append: Future | None = None
         self._batch: list[tuple] = []
 
     def append_current_pose(self) -> None:
-        """Evaluate the current pose, and write its batch when the batch is full."""
+        """Evaluate the current pose, and append its batch when the batch is full."""
         self._batch.append((*self._evaluator.evaluate(), self._pose_setter.is_at_rest))
         self.pose_count += 1
         # A pose that took seconds to settle is written at once.
         if len(self._batch) == self._batch_size or self._pose_setter.is_settling:
-            self.flush()
+            self._wait_for_append()
+            self._pending_append = self._pool.submit(self._append, self._batch)
+            self._batch = []
+
+    def _wait_for_append(self) -> None:
+        if self._pending_append is not None:
+            self._pending_append.result()
+
+    def _append(self, batch: list[tuple]) -> None:
+        *arrays, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
+        unsettled_indices = np.flatnonzero(~are_at_rest).tolist()
+        self._writer.append(*arrays, *([unsettled_indices] if unsettled_indices else []))
 
     def flush(self) -> None:
-        """Write all evaluated poses."""
+        """Append all evaluated poses."""
+        self._wait_for_append()
         if self._batch:
-            *arrays, are_at_rest = (np.stack(arrays) for arrays in zip(*self._batch, strict=True))
+            self._append(self._batch)
             self._batch = []
-            unsettled_indices = np.flatnonzero(~are_at_rest).tolist()
-            self._writer.append(*arrays, *([unsettled_indices] if unsettled_indices else []))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, exception_type: type | None, *_: object) -> None:
-        if exception_type is None or exception_type is GeneratorExit:
-            self.flush()
+        try:
+            if exception_type is None or exception_type is GeneratorExit:
+                self.flush()
+        finally:
+            self._pool.shutdown()
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
