@@ -3,8 +3,11 @@
 
 import argparse
 import os
+import shutil
 import sys
 from pathlib import Path
+
+import bpy
 
 from ..core.files.stop_signals import exit_on_stop_signal
 from ..evaluation.video import write_video
@@ -28,5 +31,6 @@ def run(options: argparse.Namespace) -> None:
         )
     sys.stdout.flush()
     sys.stderr.flush()
-    # Nothing is left to do, and Blender 4.5 as a module may hang at its end.
+    # Nothing is left to do but to remove Blender's own folder; Blender 4.5 as a module may hang at its end.
+    shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
     os._exit(0)

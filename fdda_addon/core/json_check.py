@@ -50,7 +50,7 @@ def check_json(value: object, description: object, key_path: str = "it") -> None
     elif isinstance(description, tuple):
         return None if value is None else check_json(value, description[0], key_path)
     elif isinstance(description, dict):
-        is_valid = isinstance(value, dict)
+        is_valid = isinstance(value, dict) and all(len(key) <= MAX_TEXT_LENGTH for key in value)
         for key, inner in description.items() if is_valid else ():
             names = list(value) if key is str else [key.removesuffix("?")]
             for name in names:

@@ -74,7 +74,8 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
 
     def check(self, _context: bpy.types.Context) -> bool:
         """Give the file in the browser the extension of a new format, and take the format of a typed extension."""
-        path, (stem, suffix) = self.filepath, os.path.splitext(self.filepath)
+        before, path = (self.filepath, self.format, self.samples), self.filepath
+        stem, suffix = os.path.splitext(path)
         typed_format = FORMATS.get(suffix.lower())
         if self.format == self._checked_format and typed_format:
             self.format = typed_format
@@ -83,7 +84,7 @@ class FDDA_OT_bake(FileJobOperator, bpy.types.Operator):
         self._checked_format = self.format
         if self.format == ".usdc":
             self.samples = 1
-        return self.filepath != path
+        return (self.filepath, self.format, self.samples) != before
 
     def draw(self, _context: bpy.types.Context) -> None:
         column = self.layout.column()

@@ -198,9 +198,7 @@ class FDDA_OT_train(TrainingOperator, bpy.types.Operator):
         recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
         model = Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
         mesh_objects = [mesh_object, *(rig.mesh_object for rig in self.rigs(context) if rig.mesh_object != mesh_object)]
-        self._note = ""
-        if not is_detached(model):
-            mesh_objects, self._note = recorded_meshes(mesh_objects, recording)
+        mesh_objects, self._note = recorded_meshes(mesh_objects, recording)
         self.state.steps = self.training_steps(mesh_object)
         return (yield from self.train(mesh_objects, recording, model, self.warm_start))
 

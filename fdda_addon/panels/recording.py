@@ -144,7 +144,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if content.state is FolderState.COMPLETE:
         row = layout.row()
         row.scale_y = 1.3
-        draw_button(row, context, "fdda.train", "Train", "PLAY", has_recording)
+        draw_button(row, context, "fdda.train", "Train", "PLAY", lambda each: each == rig or is_in_recording(each, rig))
         text = f"{format_poses(content.poses, content.alone_poses)}. Next: Train"
         draw_wrapped(layout, context, f"Recorded: {text}", "CHECKMARK")
     elif content.state is FolderState.INCOMPLETE:

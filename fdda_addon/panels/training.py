@@ -17,7 +17,7 @@ from ..scene.draw_cache import computed_once
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
-from .recording import has_recording, read_content
+from .recording import has_recording, is_in_recording, read_content
 from .section import (
     Section,
     draw_advanced,
@@ -170,7 +170,7 @@ def _draw_settings(
     row.enabled = can_train and is_recorded
     row.scale_y = 1.3
     text = "Train" if trained is None else "Train Again"
-    draw_button(row, context, "fdda.train", text, "PLAY", has_recording)
+    draw_button(row, context, "fdda.train", text, "PLAY", lambda each: each == rig or is_in_recording(each, rig))
     if isinstance(content, str):
         draw_wrapped(layout, context, content, "ERROR")
     elif not is_recorded:

@@ -13,6 +13,7 @@ from ..core.formats.model_info import ModelInfo
 from ..core.mathematics.features import FLOAT32_ROUNDING_RATIO
 from ..core.mathematics.key_joints import select_joints
 from ..core.rig import STATIC_JOINT, Fingerprint, Joint, MeshPart, Rig, join_faces, join_positions, join_weights
+from ..core.wording import format_count
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.control_reader import ControlReader
@@ -209,8 +210,8 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
     size = np.ptp(rest_positions, axis=0).max() if vertex_count else 0.0
     if size <= FLOAT32_ROUNDING_RATIO * np.abs(rest_positions).max(initial=0.0):
         raise RigError(
-            f"All {vertex_count:,} vertices of '{object_name}' lie at one point in the rest pose, so the mesh has no "
-            "size; give the mesh, or its Basis shape key, its shape."
+            f"'{object_name}' has no size: {format_count(vertex_count, 'vertex', 'vertices')} at one point in the rest "
+            "pose; give the mesh, or its Basis shape key, its shape, or choose another object."
         )
 
 

@@ -62,7 +62,7 @@ def remove_armature(rig) -> None:
         (
             lambda rig: rig.mesh_object.data.clear_geometry(),
             (),
-            "All 0 vertices of 'elbow' lie at one point",
+            "'elbow' has no size: 0 vertices at one point",
         ),
         (add_second_mesh, ("--object", "glove"), "no mesh object 'glove'; its mesh objects: 'elbow', 'sleeve'."),
         (add_second_mesh, (), "2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object."),

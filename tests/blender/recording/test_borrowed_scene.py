@@ -204,10 +204,10 @@ NOT_FINITE = "of 300 vertices of 'elbow' have coordinates that are not finite, t
         (move_vertices(slice(5, 7), math.inf), f"2 {NOT_FINITE} 5; delete"),
         (
             move_vertices(slice(None), 1000.1),
-            "All 300 vertices of 'elbow' lie at one point in the rest pose, so the mesh has no size; give the",
+            "'elbow' has no size: 300 vertices at one point in the rest pose; give the",
         ),
-        (collapse_basis_key, "All 300 vertices of 'elbow' lie at one point in the rest pose"),
-        (keep_one_vertex, "All 1 vertices of 'elbow' lie at one point in the rest pose"),
+        (collapse_basis_key, "'elbow' has no size: 300 vertices at one point in the rest pose"),
+        (keep_one_vertex, "'elbow' has no size: 1 vertex at one point in the rest pose"),
         (
             lambda rig: edit_bones(rig, lambda bones: setattr(bones["lower"], "tail", (math.nan, 0, 0))),
             "The bone 'lower' has no length or no finite place in the rest pose; give its head and its tail",
