@@ -15,7 +15,7 @@ from fdda_addon.scene.compatibility import node_input_settings
 from fdda_addon.scene.scene_rig import find_rig
 
 from ..conftest import ELBOW_RIG, assert_plays, evaluated_positions, pose, rig_positions, with_deformation
-from ..playback import add_shape_key
+from ..playback import FRAME, add_shape_key
 from ..rig_changes import drive_b_bone, trigger_check
 
 
@@ -337,7 +337,7 @@ def test_a_driven_setting_of_a_b_bone_follows_the_pose(rig, elbow_files):
     drive_b_bone()
     bind(rig, with_deformation(elbow_files.model, read_deformation(rig)))
     before = bone.bbone_easein
-    bpy.context.scene.frame_set(25)
+    bpy.context.scene.frame_set(FRAME)
     assert abs(bone.bbone_easein - before) > 0.1
     bone.bbone_easeout = 1.0  # as before, but the armature is checked
     trigger_check("view layer")
