@@ -90,7 +90,8 @@ def test_a_wrong_path_action_or_binding_is_refused(active, tmp_path):
 )
 def test_file_and_format_in_the_browser_follow_each_other(typed, old_format, chosen, file, file_format):
     browser = SimpleNamespace(filepath=typed, format=chosen, _checked_format=old_format, samples=2)
-    assert FDDA_OT_bake.check(browser, None) == (file != typed)
+    changed = (file, file_format) != (typed, chosen) or file_format == ".usdc"
+    assert FDDA_OT_bake.check(browser, None) == changed, "the browser is drawn again"
     assert (browser.filepath, browser.format) == (file, file_format)
     assert browser.samples == (1 if file_format == ".usdc" else 2), "USD has one sample per frame"
 
