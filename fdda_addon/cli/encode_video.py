@@ -9,6 +9,7 @@ from pathlib import Path
 
 import bpy
 
+from ..core.errors import FDDAError, exit_status
 from ..core.files.stop_signals import exit_on_stop_signal
 from ..evaluation.video import write_video
 from .progress import ProgressPrinter
@@ -24,13 +25,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     # The process that started this one removes the file.
     exit_on_stop_signal()
-    encoding, size = (options.container, options.codec), (options.width, options.height)
+    encoding, size, status = (options.container, options.codec), (options.width, options.height), 0
     with ProgressPrinter() as progress:
-        write_video(
-            options.folder, options.out, encoding, size, options.fps, lambda *counts: progress.show("encoding", *counts)
-        )
+        try:
+            pictures, out, fps = options.folder, options.out, options.fps
+            write_video(pictures, out, encoding, size, fps, lambda *counts: progress.show("encoding", *counts))
+        except FDDAError as error:
+            print(f"Error: {error}", file=sys.stderr)
+            status = exit_status(error)
     sys.stdout.flush()
     sys.stderr.flush()
     # Nothing is left to do but to remove Blender's own folder; Blender 4.5 as a module may hang at its end.
     shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
-    os._exit(0)
+    os._exit(status)
