@@ -159,7 +159,9 @@ class RecordingWriter:
             file.truncate(max(end_offset, file.seek(0, os.SEEK_END)))
             file.seek(0)
             file.write(header)
-            file.truncate(end_offset)
+            # Windows does not shorten a file that is mapped. What is beyond the end is ignored, too.
+            with contextlib.suppress(PermissionError):
+                file.truncate(end_offset)
             file.seek(len(header) + self.complete * row_bytes)
             # Allocate the space of all poses now, so that a full disk is found before any pose is evaluated.
             if hasattr(os, "posix_fallocate"):
