@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`.
+"""Make the pictures of the window from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`.
 
-The pictures of the errors are of a well-trained model: `tests/gui/run.py out/gui --story film`, with the arm that
-`make demo` has bound as out/gui/work/arm.blend, beside its model. `make_manual.py` makes those with numbers.
+`make_manual.py` makes those with numbers. The pictures of simulations are of a Blender that a person has used.
 """
 
 import sys
@@ -19,16 +18,11 @@ TEXT_BRIGHTNESS = 150
 """Pixels are part of a text if their darkest channel exceeds this value."""
 BOTTOM_MARGIN = 16
 COLUMN_GAP = 12
-SECTION_PICTURES = {
-    "simulation_sections": ("target", "flesh_recorded"),
-}
-"""Steps of the test whose sections are shown side by side, by the name of the picture."""
 WINDOW_PICTURES = {
-    "sidebar_evaluation": "04_jump_to_the_worst_frame",
-    "manual_heat_map": "03_show_the_heat_map",
-    "simulation_settling": "settling",
-    "simulation_plays": "flesh_plays",
+    "sidebar_evaluation": "17_jump_to_the_worst_frame",
+    "manual_heat_map": "16_show_the_heat_map",
 }
+"""Steps of the story `path` whose window is shown, by the name of the picture."""
 
 
 def sections_height(picture: Image.Image) -> int:
@@ -61,11 +55,5 @@ def write_picture(picture: Image.Image, name: str) -> None:
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-
-    def open_step(name: str) -> Image.Image:
-        return Image.open(folder / f"{name}.png")
-
-    for name, steps in SECTION_PICTURES.items():
-        write_picture(join_pictures([crop_sections(open_step(each)) for each in steps]), name)
-    for name, each in WINDOW_PICTURES.items():
-        write_picture(open_step(each).crop(VIEW_BOUNDS), name)
+    for name, step in WINDOW_PICTURES.items():
+        write_picture(Image.open(folder / f"{step}.png").crop(VIEW_BOUNDS), name)
