@@ -110,8 +110,9 @@ def add_variable(driver: bpy.types.Driver, name: str, source: bpy.types.ID, read
     """Add a variable to a driver.
 
     Args:
-        source, read: a datablock and the path of a number; or an object, and one of its bones (or "") with a transform
-            channel in local space, such as `("upper", "ROT_X")`.
+        source: the datablock that is read.
+        read: the path of a number. Or, if the source is an object, the name of one of its bones ("" for the object) and
+            a transform channel in local space, such as `("upper", "ROT_X")`.
     """
     variable = driver.variables.new()
     variable.name, variable.type = name, "SINGLE_PROP" if isinstance(read, str) else "TRANSFORMS"
